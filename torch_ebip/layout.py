@@ -1,0 +1,136 @@
+"""Which degree of freedom (DoF) is which: its modality, its unit, and who controls it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True, init=False)
+class Modality:
+    """A group of DoFs that one sensor measures, or one agent moves, in one unit.
+
+    Args:
+        name: unique within a layout, for example ``"ball"``.
+        dofs: names of its DoFs, unique within a layout, for example ``["ball.x", "ball.y", "ball.z"]``.
+        unit: SI unit of every DoF of the group (``"m"``, ``"rad"``, ``"m/s^2"``); ``"1"`` if it has none.
+        controlled: whether the robot moves these DoFs (the paper's D_c) or they are only observed (D_o).
+
+    Raises:
+        ValueError: an empty name or unit, no DoFs, or a DoF named twice.
+    """
+
+    name: str
+    dofs: tuple[str, ...]
+    unit: str
+    controlled: bool
+
+    def __init__(self, name: str, dofs: Sequence[str], unit: str, controlled: bool = False) -> None:
+        if isinstance(dofs, str):
+            raise ValueError(f"modality {name!r}: dofs must be a sequence of names, got the string {dofs!r}")
+        if not name or not unit:
+            raise ValueError(f"a modality needs a name and a unit, got name={name!r}, unit={unit!r}")
+        names = tuple(str(dof) for dof in dofs)
+        if not names or not all(names):
+            raise ValueError(f"modality {name!r} needs at least one DoF, each with a name, got {names!r}")
+        _reject_repeats(f"modality {name!r}: DoF", names)
+        object.__setattr__(self, "name", str(name))
+        object.__setattr__(self, "dofs", names)
+        object.__setattr__(self, "unit", str(unit))
+        object.__setattr__(self, "controlled", bool(controlled))
+
+
+@dataclass(frozen=True, init=False)
+class Layout:
+    """The columns of a recording: modalities side by side, in order.
+
+    Args:
+        modalities: at least one; names and DoFs are unique.
+
+    Raises:
+        ValueError: no modality, or a modality or DoF named twice.
+    """
+
+    modalities: tuple[Modality, ...]
+
+    def __init__(self, modalities: Sequence[Modality]) -> None:
+        object.__setattr__(self, "modalities", tuple(modalities))
+        if not self.modalities:
+            raise ValueError("a layout needs at least one modality")
+        _reject_repeats("modality", self.names)
+        _reject_repeats("DoF", self.dofs)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the modalities, in order."""
+        return tuple(modality.name for modality in self.modalities)
+
+    @property
+    def dofs(self) -> tuple[str, ...]:
+        """Names of all DoFs, in column order; D of them."""
+        return tuple(dof for modality in self.modalities for dof in modality.dofs)
+
+    @property
+    def n_dofs(self) -> int:
+        """D, the number of columns."""
+        return len(self.dofs)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """The unit of each DoF, D of them."""
+        return tuple(modality.unit for modality in self.modalities for _ in modality.dofs)
+
+    @property
+    def controlled(self) -> Tensor:
+        """bool [D]: whether the robot moves this DoF."""
+        return torch.tensor([modality.controlled for modality in self.modalities for _ in modality.dofs])
+
+    @property
+    def modality_of_dof(self) -> Tensor:
+        """int64 [D]: index into `modalities` of each DoF."""
+        return torch.tensor([i for i, modality in enumerate(self.modalities) for _ in modality.dofs])
+
+    def __getitem__(self, name: str) -> Modality:
+        """The modality of that name; ValueError if there is none."""
+        for modality in self.modalities:
+            if modality.name == name:
+                return modality
+        raise ValueError(f"no modality {name!r}; this layout has {', '.join(self.names)}")
+
+    def slice(self, name: str) -> slice:
+        """The columns of a modality; ValueError if there is none of that name."""
+        start = 0
+        for modality in self.modalities:
+            if modality.name == name:
+                return slice(start, start + len(modality.dofs))
+            start += len(modality.dofs)
+        raise ValueError(f"no modality {name!r}; this layout has {', '.join(self.names)}")
+
+    def mask(self, names: Iterable[str]) -> Tensor:
+        """bool [D]: True in the columns of the named modalities or single DoFs.
+
+        Raises:
+            ValueError: a name that is neither a modality nor a DoF.
+        """
+        names = [names] if isinstance(names, str) else list(names)
+        selected = torch.zeros(self.n_dofs, dtype=torch.bool)
+        for name in names:
+            if name in self.names:
+                selected[self.slice(name)] = True
+            elif name in self.dofs:
+                selected[self.dofs.index(name)] = True
+            else:
+                raise ValueError(
+                    f"no modality or DoF {name!r}; the modalities are {', '.join(self.names)}, "
+                    f"the DoFs {', '.join(self.dofs)}"
+                )
+        return selected
+
+
+def _reject_repeats(what: str, names: Sequence[str]) -> None:
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise ValueError(f"{what} named more than once: {', '.join(repeated)}")
