@@ -1,0 +1,84 @@
+"""What every family of basis functions shares: the contract, and what happens outside the interval [0, 1]."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import torch
+from torch import Tensor, nn
+
+
+class Basis(nn.Module, ABC):
+    """B functions of phase, Phi(phi): the paper's Section III-A.
+
+    A filter's members run past both ends of the interaction. There every family continues in the direction of
+    its slope at the end, ever more slowly: Phi(c) + Phi'(c) s, with c the nearer end and s the softsign of the
+    distance to it, which stays below `margin`. So a member beyond the end keeps a gradient and can be called
+    back, and no polynomial explodes.
+
+    Args:
+        n_features: B, how many functions there are.
+    """
+
+    margin = 0.1
+    n_features: int
+
+    def __init__(self, n_features: int) -> None:
+        super().__init__()
+        if n_features < 1:
+            raise ValueError(f"{type(self).__name__} needs at least one function, got {n_features}")
+        self.n_features = n_features
+
+    @abstractmethod
+    def evaluate(self, phase: Tensor) -> tuple[Tensor, Tensor]:
+        """Values and slopes d/dphi, [..., n_features] each, at phases [...] within [0, 1]."""
+
+    def forward(self, phase: Tensor) -> Tensor:
+        """Features [..., n_features] at phases [...] (any real number)."""
+        inside, excess = _split(phase)
+        values, slopes = self.evaluate(inside)
+        return values + slopes * (excess / (1 + excess.abs() / self.margin)).unsqueeze(-1)
+
+    def derivative(self, phase: Tensor) -> Tensor:
+        """d features / d phase, [..., n_features], at phases [...]; the exact derivative of `forward`."""
+        inside, excess = _split(phase)
+        _, slopes = self.evaluate(inside)
+        return slopes * (1 + excess.abs() / self.margin).pow(-2).unsqueeze(-1)
+
+    def extra_repr(self) -> str:
+        """The settings, as they are written in a constructor call; equal ones make equal bases."""
+        return f"n_features={self.n_features}"
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and isinstance(other, Basis) and self.extra_repr() == other.extra_repr()
+
+    def __hash__(self) -> int:
+        return hash((type(self).__name__, self.extra_repr()))
+
+
+def _split(phase: Tensor) -> tuple[Tensor, Tensor]:
+    inside = phase.clamp(0, 1)
+    return inside, phase - inside
+
+
+def spaced_centres(count: int) -> Tensor:
+    """[count] centres from 0 to 1 (0.5 for a single one), float64."""
+    if count == 1:
+        return torch.tensor([0.5], dtype=torch.float64)
+    return torch.linspace(0, 1, count, dtype=torch.float64)
+
+
+def checked_width(name: str, count: int, width: float | None) -> float:
+    """The given width, or the spacing of the centres; ValueError unless it is positive."""
+    width = 1 / max(count - 1, 1) if width is None else float(width)
+    if not 0 < width < float("inf"):
+        raise ValueError(f"{name}: width must be a positive phase, got {width}")
+    return width
+
+
+def with_offset(values: Tensor, slopes: Tensor, offset: bool) -> tuple[Tensor, Tensor]:
+    """Append the constant function, for families that cannot represent one."""
+    if not offset:
+        return values, slopes
+    one = torch.ones_like(values[..., :1])
+    return torch.cat([values, one], dim=-1), torch.cat([slopes, torch.zeros_like(one)], dim=-1)

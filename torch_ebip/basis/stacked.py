@@ -1,0 +1,111 @@
+"""One basis for each DoF: the paper's observation function h(phi, w)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torch_ebip.basis.base import Basis
+
+
+class _Run(NamedTuple):
+    """Neighbouring DoFs with equal bases: which basis, which DoFs, which weights."""
+
+    basis: int
+    dofs: slice
+    weights: slice
+
+
+class StackedBasis(nn.Module):
+    """A basis for each of D DoFs and the projection of weights through them, y = h(phi, w).
+
+    The weights of a state are those of the first DoF, then of the second, and so on. Equal bases are
+    evaluated once, and neighbouring DoFs that share one are projected together.
+
+    Args:
+        bases: D of them; two with the same class and settings are equal.
+
+    Raises:
+        ValueError: no basis.
+    """
+
+    def __init__(self, bases: Sequence[Basis]) -> None:
+        super().__init__()
+        if not bases:
+            raise ValueError("StackedBasis needs a basis for at least one DoF")
+        unique = list(dict.fromkeys(bases))
+        self.unique = nn.ModuleList(unique)
+        self._basis_of_dof = tuple(unique.index(basis) for basis in bases)
+        counts = [basis.n_features for basis in bases]
+        starts = [sum(counts[:i]) for i in range(len(counts) + 1)]
+        self._weight_slices = tuple(slice(a, b) for a, b in pairwise(starts))
+        self._runs = tuple(self._find_runs())
+
+    @property
+    def bases(self) -> tuple[Basis, ...]:
+        """The basis of each DoF, D of them."""
+        return tuple(self.unique[i] for i in self._basis_of_dof)  # type: ignore[misc]
+
+    @property
+    def n_dofs(self) -> int:
+        """D."""
+        return len(self._basis_of_dof)
+
+    @property
+    def n_weights(self) -> int:
+        """How many weights all DoFs have together (the paper's B)."""
+        return self._weight_slices[-1].stop
+
+    @property
+    def weight_slices(self) -> tuple[slice, ...]:
+        """Where each DoF's weights are, D of them."""
+        return self._weight_slices
+
+    def dof_of_weight(self) -> Tensor:
+        """int64 [n_weights]: which DoF a weight belongs to."""
+        counts = torch.tensor([part.stop - part.start for part in self._weight_slices])
+        return torch.repeat_interleave(torch.arange(self.n_dofs), counts)
+
+    def select(self, dofs: Tensor) -> StackedBasis:
+        """The stack of some DoFs only: bool [D], at least one True."""
+        if dofs.shape != (self.n_dofs,) or dofs.dtype != torch.bool:
+            raise ValueError(f"dofs must be bool [{self.n_dofs}], got {dofs.dtype} {tuple(dofs.shape)}")
+        return StackedBasis([basis for basis, chosen in zip(self.bases, dofs.tolist(), strict=True) if chosen])
+
+    def project(self, phase: Tensor, weights: Tensor) -> Tensor:
+        """h(phi, w): phases [...] and weights [..., n_weights] of shapes that broadcast -> values [..., D]."""
+        return self._project(phase, weights, lambda basis, at: basis(at))
+
+    def project_derivative(self, phase: Tensor, weights: Tensor) -> Tensor:
+        """dh/dphi, shapes as `project`: the first column of the paper's Jacobian (equation of H_t)."""
+        return self._project(phase, weights, lambda basis, at: basis.derivative(at))
+
+    def _project(self, phase: Tensor, weights: Tensor, features: Callable[[Basis, Tensor], Tensor]) -> Tensor:
+        if weights.shape[-1] != self.n_weights:
+            raise ValueError(f"weights must end in {self.n_weights}, got {tuple(weights.shape)}")
+        evaluated = [features(basis, phase) for basis in self.unique]  # type: ignore[arg-type]
+        parts = []
+        for run in self._runs:
+            count = run.dofs.stop - run.dofs.start
+            block = weights[..., run.weights].reshape(*weights.shape[:-1], count, -1)
+            parts.append((block @ evaluated[run.basis].unsqueeze(-1)).squeeze(-1))
+        return torch.cat(parts, dim=-1)
+
+    def _find_runs(self) -> list[_Run]:
+        runs: list[_Run] = []
+        for dof, basis in enumerate(self._basis_of_dof):
+            weights = self._weight_slices[dof]
+            if runs and runs[-1].basis == basis:
+                last = runs.pop()
+                runs.append(_Run(basis, slice(last.dofs.start, dof + 1), slice(last.weights.start, weights.stop)))
+            else:
+                runs.append(_Run(basis, slice(dof, dof + 1), weights))
+        return runs
+
+    def extra_repr(self) -> str:
+        """Sizes."""
+        return f"n_dofs={self.n_dofs}, n_weights={self.n_weights}"

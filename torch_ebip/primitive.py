@@ -1,0 +1,152 @@
+"""The interaction primitive: what a set of demonstrations says in the space of basis weights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from torch_ebip.basis.regression import (
+    Samples,
+    correlation_time,
+    mean_squared_residual,
+    regress,
+    samples_of,
+)
+from torch_ebip.basis.selection import select_basis
+from torch_ebip.basis.stacked import StackedBasis
+from torch_ebip.demonstrations import Demonstrations
+from torch_ebip.layout import Layout
+
+
+class InteractionPrimitive(nn.Module):
+    """Weights, phase velocities and closed-form noise of N demonstrations; made by `fit`.
+
+    Attributes:
+        layout: what the D DoFs are.
+        basis: one basis a DoF.
+        rate: samples a second of the demonstrations, Hz.
+        weights: [N, n_weights], least-squares weights of each demonstration.
+        phase_velocity: [N], 1 / duration, 1/s.
+        residual_variance: [D], the paper's closed-form R (Section IV): the mean over demonstrations of each
+            one's mean squared residual, in squared units of the DoF.
+        residual_correlation_time: [D], integrated autocorrelation time of those residuals, in samples.
+        value_variance: [D], variance of each DoF over all measured samples, squared units.
+        end_variance: [D], variance over demonstrations of h(1, w), squared units.
+    """
+
+    weights: Tensor
+    phase_velocity: Tensor
+    residual_variance: Tensor
+    residual_correlation_time: Tensor
+    value_variance: Tensor
+
+    def __init__(
+        self,
+        layout: Layout,
+        basis: StackedBasis,
+        rate: float,
+        weights: Tensor,
+        phase_velocity: Tensor,
+        residual_variance: Tensor,
+        residual_correlation_time: Tensor,
+        value_variance: Tensor,
+    ) -> None:
+        super().__init__()
+        self.layout = layout
+        self.basis = basis
+        self.rate = rate
+        self.register_buffer("weights", weights)
+        self.register_buffer("phase_velocity", phase_velocity)
+        self.register_buffer("residual_variance", residual_variance)
+        self.register_buffer("residual_correlation_time", residual_correlation_time)
+        self.register_buffer("value_variance", value_variance)
+
+    @classmethod
+    def fit(cls, demonstrations: Demonstrations, basis: StackedBasis | None = None) -> InteractionPrimitive:
+        """Batched least squares (float64) of all demonstrations and DoFs, tolerant of missing samples.
+
+        Args:
+            demonstrations: at least two.
+            basis: default: `select_basis(demonstrations)`.
+
+        Returns:
+            A primitive in the dtype and on the device of the demonstrations.
+
+        Raises:
+            ValueError: one demonstration only; a basis for another number of DoFs; a demonstration shorter
+                than its basis has functions; a DoF that was never measured.
+        """
+        if len(demonstrations) < 2:
+            raise ValueError("a primitive needs at least 2 demonstrations to have a spread, got 1")
+        basis = select_basis(demonstrations) if basis is None else basis
+        layout = demonstrations.layout
+        if basis.n_dofs != layout.n_dofs:
+            raise ValueError(f"the basis is for {basis.n_dofs} DoFs, the demonstrations have {layout.n_dofs}")
+        largest = max(part.n_features for part in basis.bases)
+        for index, trajectory in enumerate(demonstrations):
+            if len(trajectory) < largest:
+                raise ValueError(
+                    f"demonstration {index} has {len(trajectory)} samples, fewer than the {largest} functions "
+                    "of the basis"
+                )
+        samples = samples_of(demonstrations)
+        weights = samples.values.new_empty(len(demonstrations), basis.n_weights)
+        variance = samples.values.new_empty(layout.n_dofs)
+        correlation = samples.values.new_empty(layout.n_dofs)
+        for unique in dict.fromkeys(basis.bases):
+            dofs = [d for d, other in enumerate(basis.bases) if other == unique]
+            part = Samples(samples.phase, *(tensor[..., dofs] for tensor in samples[1:]))
+            fit = regress(unique, part)
+            for i, dof in enumerate(dofs):
+                weights[:, basis.weight_slices[dof]] = fit.weights[:, i]
+            variance[dofs] = mean_squared_residual(fit, part).nanmean(0)
+            correlation[dofs] = correlation_time(fit, part)
+        spread = _measured_variance(samples)
+        # A DoF that is fitted exactly would have R = 0, and with it a singular innovation covariance.
+        variance = torch.maximum(variance, 1e-10 * spread).clamp(min=1e-12)
+        dtype = demonstrations[0].dtype
+        velocity = 1 / demonstrations.durations.to(weights)
+        tensors: Sequence[Tensor] = (weights, velocity, variance, correlation, spread)
+        return cls(layout, basis, demonstrations.rate, *(tensor.to(dtype) for tensor in tensors))
+
+    def __len__(self) -> int:
+        return len(self.weights)
+
+    @property
+    def correlated_residual_variance(self) -> Tensor:
+        """[D]: a corrected closed form, `residual_variance` times `residual_correlation_time`.
+
+        The paper takes the residual for white noise; it is misfit of the basis, correlated over many samples,
+        so a filter that believes R draws the same information again and again. n samples with integrated
+        autocorrelation time tau carry what n / tau independent ones would.
+        """
+        return self.residual_variance * self.residual_correlation_time
+
+    @property
+    def end_variance(self) -> Tensor:
+        """[D]: variance over demonstrations of the value at phase 1."""
+        one = torch.ones(len(self), dtype=self.weights.dtype, device=self.weights.device)
+        return self.basis.project(one, self.weights).var(0)
+
+    def subset(self, indices: Tensor) -> InteractionPrimitive:
+        """The same basis and noise with some of the demonstrations, int64 [M]: they need no new regression."""
+        return InteractionPrimitive(
+            self.layout,
+            self.basis,
+            self.rate,
+            self.weights[indices],
+            self.phase_velocity[indices],
+            self.residual_variance,
+            self.residual_correlation_time,
+            self.value_variance,
+        )
+
+
+def _measured_variance(samples: Samples) -> Tensor:
+    count = samples.observed.sum((0, 1))
+    values = torch.where(samples.observed, samples.values, 0)
+    mean = values.sum((0, 1)) / count
+    deviation = torch.where(samples.observed, samples.values - mean, 0)
+    return deviation.square().sum((0, 1)) / count
