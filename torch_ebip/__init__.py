@@ -1,6 +1,39 @@
-"""torch_ebip."""
+"""torch_ebip: differentiable ensemble filters for human-robot interaction.
 
+Ensemble Bayesian Interaction Primitives (Campbell, Stepputtis & Ben Amor, RSS 2019) as PyTorch modules.
+"""
+
+from torch_ebip import functional
+from torch_ebip.basis import (
+    Basis,
+    BSplineBasis,
+    GaussianBasis,
+    PolynomialBasis,
+    SigmoidBasis,
+    StackedBasis,
+    select_basis,
+)
 from torch_ebip.demonstrations import Demonstrations
+from torch_ebip.filters import EnsembleFilter, Filter, Forecast, Trace, ebip
 from torch_ebip.layout import Layout, Modality
+from torch_ebip.primitive import InteractionPrimitive
 
-__all__ = ["Demonstrations", "Layout", "Modality"]
+__all__ = [
+    "BSplineBasis",
+    "Basis",
+    "Demonstrations",
+    "EnsembleFilter",
+    "Filter",
+    "Forecast",
+    "GaussianBasis",
+    "InteractionPrimitive",
+    "Layout",
+    "Modality",
+    "PolynomialBasis",
+    "SigmoidBasis",
+    "StackedBasis",
+    "Trace",
+    "ebip",
+    "functional",
+    "select_basis",
+]

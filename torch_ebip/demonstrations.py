@@ -41,9 +41,7 @@ class Demonstrations:
             raise ValueError("at least one demonstration is needed, got none")
         self.layout = layout
         self.rate = float(rate)
-        self.trajectories = tuple(
-            _checked(i, trajectory, layout) for i, trajectory in enumerate(trajectories)
-        )
+        self.trajectories = tuple(_checked(i, trajectory, layout) for i, trajectory in enumerate(trajectories))
         if len({(trajectory.dtype, trajectory.device) for trajectory in self.trajectories}) > 1:
             raise ValueError("all trajectories must have one dtype and live on one device")
         self.columns = {name: np.asarray(column) for name, column in (columns or {}).items()}
@@ -102,9 +100,7 @@ class Demonstrations:
 
     def pad(self) -> tuple[Tensor, Tensor]:
         """One batch: values [N, T, D] (NaN where not measured or past the end) and observed, bool [N, T, D]."""
-        values = torch.nn.utils.rnn.pad_sequence(
-            list(self.trajectories), batch_first=True, padding_value=math.nan
-        )
+        values = torch.nn.utils.rnn.pad_sequence(list(self.trajectories), batch_first=True, padding_value=math.nan)
         return values, ~values.isnan()
 
     def to(self, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Demonstrations:

@@ -76,9 +76,7 @@ def select_basis(demonstrations: Demonstrations, candidates: Sequence[Basis] | N
     return StackedBasis([best[modality.name].basis for modality in layout.modalities for _ in modality.dofs])
 
 
-def rank_candidates(
-    demonstrations: Demonstrations, candidates: Sequence[Basis] | None = None
-) -> list[CandidateFit]:
+def rank_candidates(demonstrations: Demonstrations, candidates: Sequence[Basis] | None = None) -> list[CandidateFit]:
     """Every candidate fitted to every modality: modalities in the layout's order, the best BIC first in each.
 
     Raises:

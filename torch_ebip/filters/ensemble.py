@@ -1,0 +1,174 @@
+"""The ensemble filter: the paper's five steps over any dynamics g and any observation h."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torch_ebip import functional
+from torch_ebip.filters.base import Filter, Forecast
+from torch_ebip.filters.localisation import Localisation
+
+
+class EnsembleState(NamedTuple):
+    """An ensemble: members [..., E, n]."""
+
+    members: Tensor
+
+    @property
+    def mean(self) -> Tensor:
+        """[..., n]."""
+        return self.members.mean(-2)
+
+    @property
+    def covariance(self) -> Tensor:
+        """[..., n, n], A'A / (E - 1)."""
+        anomalies = self.members - self.members.mean(-2, keepdim=True)
+        return anomalies.transpose(-1, -2) @ anomalies / (self.members.shape[-2] - 1)
+
+
+class FilterNoise(nn.Module):
+    """The noise of a filter, Q and R.
+
+    Args:
+        process: maps members [..., E, n], dt [...] and a generator to members with noise added.
+        measurement: maps the mean phase [...] (or None) to standard deviations [D] or [..., D].
+    """
+
+    def __init__(self, process: nn.Module, measurement: nn.Module) -> None:
+        super().__init__()
+        self.process = process
+        self.measurement = measurement
+
+
+class EnsembleFilter(Filter):
+    """Ensemble Kalman filter, stochastic (the paper's) or square-root.
+
+    Args:
+        dynamics: g, maps members [..., E, n] and dt [...] to members.
+        observation: h, maps members [..., E, n] to projections [..., E, D]. If it has ``phase(members)`` and
+            ``at(members, phase)``, as `BasisProjection` has, the filter knows phases and can forecast.
+        noise: Q and R.
+        prior: maps (batch_shape, n_members, members, generator) to initial members.
+        n_members: E.
+        n_dofs: D.
+        dt: seconds between samples where none is given.
+        square_root: deterministic update instead of perturbed observations.
+        inflation: factor on the anomalies after each update that measured something; a number, or a
+            module with a ``value`` such as `AboveOne` to learn it.
+        localisation: factors on the cross-covariances of blocks of the state.
+        dof_names: for error messages.
+
+    Raises:
+        ValueError: fewer than two members.
+    """
+
+    def __init__(
+        self,
+        dynamics: nn.Module,
+        observation: nn.Module,
+        noise: FilterNoise,
+        prior: nn.Module,
+        n_members: int,
+        n_dofs: int,
+        dt: float,
+        square_root: bool = False,
+        inflation: float | nn.Module | None = None,
+        localisation: Localisation | None = None,
+        dof_names: tuple[str, ...] | None = None,
+    ) -> None:
+        super().__init__(dt, n_dofs)
+        if n_members < 2:
+            raise ValueError(f"an ensemble needs at least 2 members to have a spread, got {n_members}")
+        self.dynamics = dynamics
+        self.observation = observation
+        self.noise = noise
+        self.prior = prior
+        self.n_members = n_members
+        self.square_root = square_root
+        self.inflation = inflation
+        self.localisation = localisation
+        self.dof_names = dof_names
+
+    def initial_state(
+        self,
+        batch_shape: tuple[int, ...] = (),
+        members: Tensor | None = None,
+        generator: torch.Generator | None = None,
+    ) -> EnsembleState:
+        """Step 1 of the paper's algorithm; see `Filter.initial_state`."""
+        return EnsembleState(self.prior(batch_shape, self.n_members, members, generator))
+
+    def _predict(self, state: EnsembleState, dt: Tensor, generator: torch.Generator | None) -> EnsembleState:
+        """Step 2: x = g(x) + N(0, Q)."""
+        return EnsembleState(self.noise.process(self.dynamics(state.members, dt), dt, generator))
+
+    def _update(
+        self, state: EnsembleState, y: Tensor, observed: Tensor, generator: torch.Generator | None
+    ) -> tuple[EnsembleState, Tensor]:
+        """Step 3: x = x + K (y + eps - h(x))."""
+        members = state.members
+        projections = self.observation(members)
+        factor = torch.diag_embed(self.noise.measurement(self._phase_or_none(members)))
+        taper = None if self.localisation is None else self.localisation()
+        try:
+            if self.square_root:
+                updated, likelihood = functional.square_root_update(members, projections, y, factor, observed, taper)
+            else:
+                draws = torch.randn(
+                    projections.shape, generator=generator, dtype=members.dtype, device=members.device
+                )
+                updated, likelihood = functional.ensemble_update(
+                    members, projections, y, factor, draws, observed, taper
+                )
+        except functional.FactorisationError as error:
+            names = "" if self.dof_names is None else f" ({', '.join(self.dof_names[i] for i in error.dofs)})"
+            raise ValueError(f"{error}{names}") from error
+        if self.inflation is not None:
+            updated = functional.inflate(updated, torch.where(observed.any(-1), self._inflation_factor(members), 1))
+        return EnsembleState(updated), likelihood
+
+    def _inflation_factor(self, members: Tensor) -> Tensor:
+        value = self.inflation.value if isinstance(self.inflation, nn.Module) else self.inflation
+        return torch.as_tensor(value, dtype=members.dtype, device=members.device)
+
+    def project(self, state: EnsembleState) -> Tensor:
+        """See `Filter.project`."""
+        mean: Tensor = self.observation(state.members).mean(-2)
+        return mean
+
+    def phase(self, state: EnsembleState) -> Tensor:
+        """See `Filter.phase`."""
+        phase = self._phase_or_none(state.members)
+        return state.members[..., 0, 0] * torch.nan if phase is None else phase
+
+    def _phase_or_none(self, members: Tensor) -> Tensor | None:
+        phase_of: Callable[[Tensor], Tensor] | None = getattr(self.observation, "phase", None)
+        return None if phase_of is None else phase_of(members)
+
+    def forecast_members(self, state: EnsembleState, phase: Tensor) -> Tensor:
+        """Each member's trajectory, [..., P, E, D], at phases [P] or [..., P].
+
+        Raises:
+            TypeError: the observation knows no phase.
+        """
+        project_at: Callable[[Tensor, Tensor], Tensor] | None = getattr(self.observation, "at", None)
+        if project_at is None:
+            raise TypeError(f"{type(self.observation).__name__} knows no phase to forecast along: it has no `at`")
+        batch = state.members.shape[:-2]
+        return project_at(state.members, phase.to(state.members).expand(*batch, -1))
+
+    def forecast(self, state: EnsembleState, phase: Tensor | None = None) -> Forecast:
+        """Steps 4 and 5: mean and variance over members of h at phases to come; see `Filter.forecast`.
+
+        At a given phase h is linear in the weights, so the mean of h is h of the mean, the paper's output.
+        """
+        if phase is None:
+            now = self.phase(state).clamp(0, 1).unsqueeze(-1)
+            phase = now + (1 - now) * torch.linspace(0, 1, 50, dtype=now.dtype, device=now.device)
+        members = self.forecast_members(state, phase)
+        phase = phase.to(members).expand(members.shape[:-2])
+        return Forecast(members.mean(-2), members.var(-2), phase)

@@ -1,0 +1,45 @@
+"""The eBIP pair: constant-velocity phase (the paper's G) and the basis projection (the paper's h).
+
+State: phase, phase velocity, weights.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from torch_ebip.basis.stacked import StackedBasis
+
+
+class ConstantVelocityPhase(nn.Module):
+    """g(x): the phase advances by its velocity times dt, all else stays (the paper's matrix G)."""
+
+    def forward(self, members: Tensor, dt: Tensor) -> Tensor:
+        """Members [..., E, n] after dt [...] seconds; the phase is not clamped."""
+        phase = members[..., :1] + members[..., 1:2] * dt[..., None, None]
+        return torch.cat([phase, members[..., 1:]], dim=-1)
+
+
+class BasisProjection(nn.Module):
+    """h(x): each member's weights through the basis at its own phase.
+
+    Args:
+        basis: one basis a DoF.
+    """
+
+    def __init__(self, basis: StackedBasis) -> None:
+        super().__init__()
+        self.basis = basis
+
+    def forward(self, members: Tensor) -> Tensor:
+        """Projections [..., E, D] of members [..., E, n]."""
+        return self.basis.project(members[..., 0], members[..., 2:])
+
+    def phase(self, members: Tensor) -> Tensor:
+        """Mean phase [...] of members [..., E, n]."""
+        return members[..., 0].mean(-1)
+
+    def at(self, members: Tensor, phase: Tensor) -> Tensor:
+        """Projections [..., P, E, D] of members [..., E, n] at phases [..., P] that all of them share."""
+        at = phase.unsqueeze(-1).expand(*phase.shape, members.shape[-2])
+        return self.basis.project(at, members[..., 2:].unsqueeze(-3))

@@ -1,0 +1,56 @@
+"""Localisation between modalities: how much of each cross-covariance an update believes."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from torch_ebip.functional import Taper
+from torch_ebip.noise.constraints import Positive
+
+
+class Localisation(nn.Module):
+    """A symmetric factor in [0, 1] for every pair of blocks (modalities, and the phase), learned.
+
+    L = V V' with non-negative rows of unit length, V_i ~ (1, s_i1, ..., s_iM): so L is positive semidefinite
+    with ones on its diagonal, and by Schur's theorem a tapered covariance stays one. All s start small and
+    different, L a little below 1 everywhere, where gradients exist. s_ii alone large cuts block i off from all
+    others; s_ik and s_jk both large keep i and j together and cut them off from the rest.
+
+    Args:
+        names: of the M blocks.
+        state_block: int64 [n], the block of each entry of the state.
+        dof_block: int64 [D], the block of each DoF.
+        start: s_ii at the beginning; L starts at about 1 - start^2 between different blocks.
+    """
+
+    state_block: Tensor
+    dof_block: Tensor
+
+    def __init__(self, names: tuple[str, ...], state_block: Tensor, dof_block: Tensor, start: float = 0.1) -> None:
+        super().__init__()
+        self.names = names
+        self.register_buffer("state_block", state_block)
+        self.register_buffer("dof_block", dof_block)
+        own = torch.eye(len(names))
+        self.loadings = Positive(start * own + 0.1 * start * (1 - own))
+
+    def select(self, state: Tensor, dofs: Tensor) -> Localisation:
+        """The same factors, with the same parameters, for some entries of state and observation (int64)."""
+        part = Localisation(self.names, self.state_block[state], self.dof_block[dofs])
+        part.loadings = self.loadings
+        return part
+
+    @property
+    def matrix(self) -> Tensor:
+        """L, [M, M]."""
+        loadings = self.loadings.value
+        rows = torch.cat([torch.ones_like(loadings[:, :1]), loadings], dim=-1)
+        rows = rows / rows.norm(dim=-1, keepdim=True)
+        matrix: Tensor = rows @ rows.T
+        return matrix
+
+    def forward(self) -> Taper:
+        """The factors spread over state and observation: [n, D] and [D, D]."""
+        columns = self.matrix[:, self.dof_block]
+        return Taper(columns[self.state_block], columns[self.dof_block])

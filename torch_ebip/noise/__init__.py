@@ -1,0 +1,17 @@
+"""Learnable process and measurement noise: constrained parameters that start at the closed form."""
+
+from torch_ebip.noise.constraints import AboveOne, Constrained, Positive, UnitInterval
+from torch_ebip.noise.measurement import MeasurementNoise
+from torch_ebip.noise.process import InteractionNoise, NoProcessNoise, PhaseNoise, WeightNoise
+
+__all__ = [
+    "AboveOne",
+    "Constrained",
+    "InteractionNoise",
+    "MeasurementNoise",
+    "NoProcessNoise",
+    "PhaseNoise",
+    "Positive",
+    "UnitInterval",
+    "WeightNoise",
+]

@@ -1,0 +1,113 @@
+"""Process noise Q of the eBIP state: of the phase always, of the weights if asked for."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from torch_ebip.noise.constraints import Positive
+
+
+class NoProcessNoise(nn.Module):
+    """Q = 0, for dynamics that bring their own noise or need none."""
+
+    def forward(self, members: Tensor, dt: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """The members [..., E, n] as they are."""
+        return members
+
+
+class PhaseNoise(nn.Module):
+    """A full 2 x 2 covariance of phase and phase velocity, from the piecewise-white acceleration model.
+
+    A constant acceleration of standard deviation sigma over each step moves (phase, velocity) by
+    (dt^2 / 2, dt) times it (Bar-Shalom, Li & Kirubarajan 2001, section 6.3.2). That matrix has rank one; the
+    factor here is diag(dt^2 / 2, dt) [[1, 0], [coupling, independent]] sigma, positive definite, with all
+    three numbers learned. They start at sigma, 1 and 0.01, the model to 1 part in 10^4.
+
+    Args:
+        acceleration: sigma at the start, 1/s^2; one number.
+    """
+
+    def __init__(self, acceleration: Tensor) -> None:
+        super().__init__()
+        self.acceleration = Positive(acceleration)
+        self.coupling = Positive(torch.ones_like(acceleration))
+        self.independent = Positive(torch.full_like(acceleration, 0.01))
+
+    def cholesky(self, dt: Tensor) -> Tensor:
+        """Lower factor of Q for steps dt [...] in seconds: [..., 2, 2]; Q in (1, 1/s) units."""
+        sigma = self.acceleration.value
+        phase = 0.5 * dt.square() * sigma
+        zero = torch.zeros_like(phase)
+        lower = [dt * sigma * self.coupling.value, dt * sigma * self.independent.value]
+        return torch.stack([torch.stack([phase, zero], -1), torch.stack(lower, -1)], -2)
+
+    def covariance(self, dt: Tensor) -> Tensor:
+        """Q for steps dt [...] in seconds: [..., 2, 2]."""
+        factor = self.cholesky(dt)
+        return factor @ factor.transpose(-1, -2)
+
+
+class WeightNoise(nn.Module):
+    """A random walk of the weights, one learned rate a modality.
+
+    Over dt seconds a weight moves by rate * sqrt(dt) times its own standard deviation over the demonstrations.
+
+    Args:
+        rates: [M], 1/sqrt(s), one a modality.
+        deviation: [n_weights], standard deviation of each weight over the demonstrations.
+        modality_of_weight: int64 [n_weights].
+    """
+
+    deviation: Tensor
+    modality_of_weight: Tensor
+
+    def __init__(self, rates: Tensor, deviation: Tensor, modality_of_weight: Tensor) -> None:
+        super().__init__()
+        self.rates = Positive(rates)
+        self.register_buffer("deviation", deviation)
+        self.register_buffer("modality_of_weight", modality_of_weight)
+
+    def scale(self, dt: Tensor) -> Tensor:
+        """Standard deviation of the step of each weight, [..., n_weights] for dt [...]."""
+        rate = self.rates.value[self.modality_of_weight] * self.deviation
+        return rate * dt.sqrt().unsqueeze(-1)
+
+
+class InteractionNoise(nn.Module):
+    """Process noise of a state (phase, phase velocity, weights).
+
+    Args:
+        phase: noise of the first two entries.
+        weights: noise of the others; default none, so that members stay in the span of the demonstrations.
+        columns: int64, which entries of ``weights`` the state holds; default all of them.
+    """
+
+    columns: Tensor | None
+
+    def __init__(self, phase: PhaseNoise, weights: WeightNoise | None = None, columns: Tensor | None = None) -> None:
+        super().__init__()
+        self.phase = phase
+        self.weights = weights
+        self.register_buffer("columns", columns)
+
+    def select(self, columns: Tensor) -> InteractionNoise:
+        """The same noise, with the same parameters, for a state with some of the weights, int64 [k]."""
+        return InteractionNoise(self.phase, self.weights, columns if self.columns is None else self.columns[columns])
+
+    def forward(self, members: Tensor, dt: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """Members [..., E, n] with noise for steps dt [...] seconds added."""
+        factor = self.phase.cholesky(dt)
+        steps = _normal_like(members[..., :2], generator) @ factor.transpose(-1, -2)
+        if self.weights is None:
+            steps = torch.nn.functional.pad(steps, (0, members.shape[-1] - 2))
+        else:
+            scale = self.weights.scale(dt)
+            scale = scale if self.columns is None else scale[..., self.columns]
+            draws = _normal_like(members[..., 2:], generator)
+            steps = torch.cat([steps, draws * scale.unsqueeze(-2)], dim=-1)
+        return members + steps
+
+
+def _normal_like(members: Tensor, generator: torch.Generator | None) -> Tensor:
+    return torch.randn(members.shape, generator=generator, dtype=members.dtype, device=members.device)
