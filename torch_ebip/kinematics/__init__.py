@@ -1,0 +1,6 @@
+"""Robot kinematics. The one place that knows pytorch-kinematics, and it imports it only when an arm is
+built."""
+
+from torch_ebip.kinematics.arm import RobotArm
+
+__all__ = ["RobotArm"]

@@ -1,0 +1,212 @@
+"""A serial robot arm as an `nn.Module`: joint angles in, pose of the tool out, differentiable.
+
+The kinematic chain itself is pytorch-kinematics' (https://github.com/UM-ARM-Lab/pytorch_kinematics), with
+three things put right around it:
+
+- its URDF reader rounds every origin to float32, here the tree is assembled in float64 from the parsed text;
+- its chains are plain objects, so `arm.double()` or `arm.to("cuda")` would leave them behind: here one chain
+  a dtype and device is cast from the float64 original when it is first needed, so that casting there and
+  back loses nothing;
+- its default backward pass is a `torch.autograd.Function` whose own derivative is silently wrong: here the
+  chain is differentiated by autograd, which is right to any order.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from importlib import resources
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+
+class RobotArm(nn.Module):
+    """Forward kinematics of the chain from a URDF's root link to `end_link`, followed by a fixed tool.
+
+    Args:
+        urdf: path of a URDF file, or the text of one (recognised by its first non-blank character, "<").
+        end_link: link whose frame carries the tool.
+        tool: homogeneous transform from `end_link` to the tool, shape [4, 4], metres; identity if left out.
+
+    `joint_names` is a tuple in the order of the joint vector.
+    """
+
+    tool: Tensor
+
+    def __init__(self, urdf: str | PathLike[str], end_link: str, tool: Tensor | None = None) -> None:
+        super().__init__()
+        self._master = _build_chain(_read(urdf), end_link)
+        self._chains: dict[tuple[torch.dtype, torch.device], Any] = {}
+        self.joint_names: tuple[str, ...] = tuple(self._master.get_joint_parameter_names())
+        self.register_buffer("tool", _checked_tool(tool))
+
+    @classmethod
+    def ur5(cls, tool: Tensor | None = None) -> RobotArm:
+        """Universal Robots UR5 (CB3 series), base frame and flange as in the manufacturer's
+        Denavit-Hartenberg table.
+
+        Args:
+            tool: homogeneous transform flange -> tool, shape [4, 4], metres; identity if left out.
+        """
+        text = resources.files("torch_ebip.kinematics").joinpath("ur5.urdf").read_text(encoding="utf-8")
+        return cls(text, "flange", tool)
+
+    @property
+    def n_joints(self) -> int:
+        return len(self.joint_names)
+
+    @property
+    def joint_limits(self) -> Tensor:
+        """Lower and upper limit of every joint, [n_joints, 2] rad; infinite where the URDF states none."""
+        return torch.tensor(self._master.get_joint_limits(), dtype=self.tool.dtype, device=self.tool.device).T
+
+    @property
+    def velocity_limits(self) -> Tensor:
+        """Largest speed of every joint, [n_joints] rad/s; infinite where the URDF states none."""
+        _, speed = self._master.get_joint_velocity_limits()
+        return torch.tensor(speed, dtype=self.tool.dtype, device=self.tool.device)
+
+    def forward(self, joints: Tensor) -> Tensor:
+        """Pose of the tool in the arm's base frame.
+
+        Args:
+            joints: angles [..., n_joints], rad, on the module's device. Computed in the wider of the two
+                dtypes.
+
+        Returns:
+            homogeneous transforms [..., 4, 4], metres.
+        """
+        if joints.ndim == 0 or joints.shape[-1] != self.n_joints:
+            raise ValueError(
+                f"joints: expected shape [..., {self.n_joints}] ({', '.join(self.joint_names)}), "
+                f"got {list(joints.shape)}"
+            )
+        if joints.device != self.tool.device:
+            raise ValueError(f"joints: expected on the arm's device, {self.tool.device}, got {joints.device}")
+        dtype = torch.promote_types(joints.dtype, self.tool.dtype)
+        chain = self._chain(dtype, joints.device)
+        flat = joints.to(dtype).reshape(math.prod(joints.shape[:-1]), self.n_joints)
+        # The last frame is the end link: the chain is serial and its frames are numbered from the root.
+        flange = chain.forward_kinematics_tensor(flat, analytical_grad=False)[-1]
+        pose: Tensor = flange @ self.tool.to(dtype)
+        return pose.reshape(*joints.shape[:-1], 4, 4)
+
+    def extra_repr(self) -> str:
+        return f"n_joints={self.n_joints}"
+
+    def _chain(self, dtype: torch.dtype, device: torch.device) -> Any:
+        """pytorch-kinematics' chain in one dtype on one device, cast once from the float64 original."""
+        key = (dtype, device)
+        if key not in self._chains:
+            self._chains[key] = copy.deepcopy(self._master).to(dtype=dtype, device=device)
+        return self._chains[key]
+
+
+def _checked_tool(tool: Tensor | None) -> Tensor:
+    """The tool transform as an own [4, 4] floating-point tensor."""
+    if tool is None:
+        return torch.eye(4)
+    if tool.shape != (4, 4):
+        raise ValueError(f"tool: expected a homogeneous transform of shape [4, 4], got {list(tool.shape)}")
+    if not tool.is_floating_point():
+        tool = tool.to(torch.get_default_dtype())
+    if not torch.equal(tool[3].cpu(), torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=tool.dtype)):
+        raise ValueError(f"tool: expected the last row 0, 0, 0, 1 (a homogeneous transform), got {tool[3].tolist()}")
+    return tool.detach().clone()
+
+
+def _read(urdf: str | PathLike[str]) -> str:
+    """The text of a URDF given as such or by its path."""
+    if isinstance(urdf, str) and urdf.lstrip().startswith("<"):
+        return urdf
+    try:
+        return Path(urdf).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(
+            f"urdf: expected the path of a readable URDF file or its XML text, got {str(urdf)[:80]!r} ({error})"
+        ) from error
+
+
+def _build_chain(text: str, end_link: str) -> Any:
+    """pytorch-kinematics' `SerialChain` in float64 from the root link to `end_link`."""
+    # Imported here: it pulls in matplotlib, scipy and a URDF parser, which nobody without an arm should wait
+    # for.
+    from pytorch_kinematics import Transform3d
+    from pytorch_kinematics.chain import Chain, SerialChain
+    from pytorch_kinematics.frame import Frame, Joint, Link
+    from pytorch_kinematics.urdf import JOINT_TYPE_MAP
+    from pytorch_kinematics.urdf_parser_py.urdf import URDF
+
+    try:
+        # Bytes: lxml, below that parser, refuses an encoding declaration in a str.
+        robot = URDF.from_xml_string(text.encode("utf-8"))
+    except Exception as error:  # the parser raises a different class for every kind of fault
+        raise ValueError(
+            f"urdf: expected a URDF <robot>, got text that does not parse ({type(error).__name__}: {error})"
+        ) from error
+    names = [link.name for link in robot.links]
+    if end_link not in names:
+        raise ValueError(f"end_link: expected one of the URDF's links ({', '.join(names)}), got {end_link!r}")
+
+    # From the end link up to the root: only these joints matter, whatever else hangs on the robot.
+    above = {joint.child: joint for joint in robot.joints}
+    path: list[Any] = []
+    link = end_link
+    while link in above:
+        path.append(above[link])
+        link = above[link].parent
+        if len(path) > len(robot.joints):
+            raise ValueError(f"urdf: expected a tree of links, got a loop through {link!r}")
+    unsupported = [joint.name for joint in path if joint.type not in JOINT_TYPE_MAP]
+    if unsupported:
+        raise ValueError(
+            f"urdf: expected joints of type {', '.join(JOINT_TYPE_MAP)} on the way to {end_link!r}, "
+            f"got others: {', '.join(unsupported)}"
+        )
+
+    root = Frame(link, Link(link), Joint(dtype=torch.float64))
+    tip = root
+    for joint in reversed(path):
+        limit = joint.limit
+        bounded = limit is not None and joint.type != "continuous"
+        frame = Frame(
+            joint.child,
+            Link(joint.child),
+            Joint(
+                joint.name,
+                offset=Transform3d(matrix=_origin(joint.origin), dtype=torch.float64),
+                joint_type=JOINT_TYPE_MAP[joint.type],
+                axis=joint.axis,
+                dtype=torch.float64,
+                limits=(limit.lower, limit.upper) if bounded else None,
+                velocity_limits=None if limit is None else (-limit.velocity, limit.velocity),
+            ),
+        )
+        tip.add_child(frame)
+        tip = frame
+    return SerialChain(Chain(root, dtype=torch.float64), end_link, dtype=torch.float64)
+
+
+def _origin(origin: Any) -> Tensor:
+    """A URDF <origin xyz rpy> as a homogeneous transform [4, 4]; R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    transform = torch.eye(4, dtype=torch.float64)
+    if origin is None:
+        return transform
+    roll, pitch, yaw = origin.rpy if origin.rpy is not None else (0.0, 0.0, 0.0)
+    cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
+    cy, sy = math.cos(yaw), math.sin(yaw)
+    transform[:3, :3] = torch.tensor(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ],
+        dtype=torch.float64,
+    )
+    if origin.xyz is not None:
+        transform[:3, 3] = torch.tensor(origin.xyz, dtype=torch.float64)
+    return transform

@@ -1,0 +1,119 @@
+"""Losses as modules. Targets that were not measured (NaN) are left out before the arithmetic."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from torch_ebip.kinematics import RobotArm
+from torch_ebip.scores import crps, energy_score
+
+
+class TrajectoryLoss(nn.Module):
+    """Mean squared error of forecasts, in units of each DoF's scale.
+
+    Args:
+        scale: [D], what counts as one unit of error of each DoF, for example its standard deviation over the
+            demonstrations; in units of the DoFs.
+        dofs: bool [D], which DoFs count; default: all.
+
+    Raises:
+        ValueError: a scale that is not positive, or no DoF.
+    """
+
+    scale: Tensor
+    dofs: Tensor
+
+    def __init__(self, scale: Tensor, dofs: Tensor | None = None) -> None:
+        super().__init__()
+        dofs = torch.ones_like(scale, dtype=torch.bool) if dofs is None else dofs
+        if scale.shape != dofs.shape or not bool((scale[dofs] > 0).all()) or not bool(dofs.any()):
+            raise ValueError("scale must be [D] and positive for the chosen DoFs, of which there must be one")
+        self.register_buffer("scale", scale)
+        self.register_buffer("dofs", dofs)
+
+    def forward(self, predicted: Tensor, target: Tensor) -> Tensor:
+        """Predicted and target [..., D] (any phases and batches in front) -> scalar, without unit."""
+        predicted, target, measured = self._scaled(predicted, target)
+        return (predicted - target).square().mul(measured).sum() / measured.sum().clamp(min=1)
+
+    def _scaled(self, predicted: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        target = target[..., self.dofs]
+        measured = ~target.isnan()
+        scale = self.scale[self.dofs]
+        return predicted[..., self.dofs] / scale, torch.where(measured, target, 0) / scale, measured
+
+
+class CRPSLoss(TrajectoryLoss):
+    """Mean fair CRPS of an ensemble forecast in units of each DoF's scale; arguments as `TrajectoryLoss`."""
+
+    def forward(self, predicted: Tensor, target: Tensor) -> Tensor:
+        """Members [..., E, D] and target [..., D] -> scalar, without unit."""
+        members, target, measured = self._scaled(predicted, target)
+        return crps(members, target).mul(measured).sum() / measured.sum().clamp(min=1)
+
+
+class EnergyScoreLoss(TrajectoryLoss):
+    """Mean fair energy score of an ensemble forecast, DoFs scaled; arguments as `TrajectoryLoss`.
+
+    A DoF that was not measured counts as forecast exactly: it is left out of the distances.
+    """
+
+    def forward(self, predicted: Tensor, target: Tensor) -> Tensor:
+        """Members [..., E, D] and target [..., D] -> scalar, without unit."""
+        members, target, measured = self._scaled(predicted, target)
+        members = torch.where(measured.unsqueeze(-2), members, 0)
+        return energy_score(members, target).mean()
+
+
+class InnovationLikelihoodLoss(nn.Module):
+    """Mean negative log-likelihood of each measured value given the past, from `Trace.log_likelihood`.
+
+    A one-step score: it prefers a small R and says little about forecasts of the end; use it beside others.
+    """
+
+    def forward(self, log_likelihood: Tensor, observed: Tensor) -> Tensor:
+        """Log-likelihoods [..., T] and observed bool [..., T, D] -> scalar, nats a measured value."""
+        return -log_likelihood.sum() / observed.sum().clamp(min=1)
+
+
+class ForwardKinematicsLoss(nn.Module):
+    """Mean distance of the tool from where it should be, through the arm's forward kinematics.
+
+    Args:
+        arm: joints -> pose.
+        rotation_weight: metres that one radian of geodesic angle between the two orientations counts for.
+    """
+
+    def __init__(self, arm: RobotArm, rotation_weight: float = 0.0) -> None:
+        super().__init__()
+        if not rotation_weight >= 0:
+            raise ValueError(f"rotation_weight must not be negative, got {rotation_weight}")
+        self.arm = arm
+        self.rotation_weight = rotation_weight
+
+    def forward(self, predicted_joints: Tensor, target_joints: Tensor) -> Tensor:
+        """Joints [..., 6] rad, both -> scalar, metres; rows with NaN in the target are left out."""
+        measured = ~target_joints.isnan().any(-1)
+        predicted = self.arm(predicted_joints)
+        target = self.arm(torch.where(measured.unsqueeze(-1), target_joints, 0))
+        distance = _norm(predicted[..., :3, 3] - target[..., :3, 3])
+        if self.rotation_weight:
+            distance = distance + self.rotation_weight * geodesic_angle(predicted[..., :3, :3], target[..., :3, :3])
+        return distance.mul(measured).sum() / measured.sum().clamp(min=1)
+
+
+def geodesic_angle(a: Tensor, b: Tensor) -> Tensor:
+    """Angle in rad [...] of the rotation between rotation matrices a and b, [..., 3, 3]; gradient 0 at 0 and pi."""
+    between = a.transpose(-1, -2) @ b
+    cosine = (between.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
+    skew = between - between.transpose(-1, -2)
+    sine = _norm(torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)) / 2
+    return torch.atan2(sine, cosine)
+
+
+def _norm(vector: Tensor) -> Tensor:
+    """Euclidean norm with gradient 0 at 0."""
+    squared = vector.square().sum(-1)
+    positive = squared > 0
+    return torch.where(positive, torch.where(positive, squared, 1).sqrt(), 0)

@@ -1,0 +1,43 @@
+"""What experiments report about a forecast, one value an interaction; NaN where the target was not measured."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from torch_ebip.filters.base import Forecast
+from torch_ebip.kinematics import RobotArm
+from torch_ebip.scores import crps as ensemble_crps
+
+Z95 = 1.959963984540054
+"""Half-width of the central 95 % interval of a normal distribution, in standard deviations."""
+
+
+def mse(forecast: Forecast, target: Tensor) -> Tensor:
+    """Squared error averaged over DoFs: forecast [..., D], target [..., D] -> [...], squared units."""
+    return (forecast.mean - target).square().nanmean(-1)
+
+
+def mae(forecast: Forecast, target: Tensor) -> Tensor:
+    """Absolute error averaged over DoFs: forecast [..., D], target [..., D] -> [...], units of the DoFs."""
+    return (forecast.mean - target).abs().nanmean(-1)
+
+
+def coverage_95(forecast: Forecast, target: Tensor) -> Tensor:
+    """Share of the DoFs whose target lies in mean +- 1.96 deviations: [..., D] -> [...]; 0.95 would be right."""
+    inside = (forecast.mean - target).abs() <= Z95 * forecast.variance.sqrt()
+    return inside.to(target.dtype).where(~target.isnan(), target).nanmean(-1)
+
+
+def crps(members: Tensor, target: Tensor) -> Tensor:
+    """Fair CRPS averaged over DoFs: members [..., E, D], target [..., D] -> [...], units of the DoFs."""
+    return ensemble_crps(members, target).nanmean(-1)
+
+
+def phase_error(phase: Tensor, true_phase: Tensor) -> Tensor:
+    """Absolute error of the inferred phase, [...] each -> [...]."""
+    return (phase - true_phase).abs()
+
+
+def tool_error(arm: RobotArm, joints: Tensor, target_joints: Tensor) -> Tensor:
+    """Distance of the tool from where it should be, joints [..., n_joints] rad -> [...], metres."""
+    return (arm(joints)[..., :3, 3] - arm(target_joints)[..., :3, 3]).norm(dim=-1)
