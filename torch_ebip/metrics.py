@@ -40,4 +40,5 @@ def phase_error(phase: Tensor, true_phase: Tensor) -> Tensor:
 
 def tool_error(arm: RobotArm, joints: Tensor, target_joints: Tensor) -> Tensor:
     """Distance of the tool from where it should be, joints [..., n_joints] rad -> [...], metres."""
-    return (arm(joints)[..., :3, 3] - arm(target_joints)[..., :3, 3]).norm(dim=-1)
+    distance: Tensor = (arm(joints)[..., :3, 3] - arm(target_joints)[..., :3, 3]).norm(dim=-1)
+    return distance

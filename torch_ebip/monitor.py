@@ -1,0 +1,112 @@
+"""TensorBoard sink: the one place that knows SummaryWriter."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import nn
+
+from torch_ebip.filters.localisation import Localisation
+from torch_ebip.layout import Layout
+from torch_ebip.noise import AboveOne, MeasurementNoise, PhaseNoise, WeightNoise
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+class Monitor:
+    """Writes what happens during tuning where TensorBoard finds it.
+
+    Args:
+        folder: of the events; created on construction.
+
+    Use it as a context manager, or call `close`.
+    """
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        # Imported here: TensorBoard takes half a second that nobody should wait for who does not watch.
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._writer: Any = SummaryWriter(str(folder))
+
+    def __enter__(self) -> Monitor:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def scalars(self, values: Mapping[str, float], step: int) -> None:
+        """One point for each name; a slash in a name groups them."""
+        for name, value in values.items():
+            self._writer.add_scalar(name, value, step)
+
+    def text(self, name: str, markdown: str) -> None:
+        """A text tab, in Markdown."""
+        self._writer.add_text(name, markdown)
+
+    def figure(self, name: str, figure: Figure, step: int) -> None:
+        """A matplotlib figure, which is closed."""
+        self._writer.add_figure(name, figure, step, close=True)
+
+    def hyperparameters(self, settings: Mapping[str, Any], metrics: Mapping[str, float]) -> None:
+        """The HParams tab: settings and the final metrics they led to."""
+        plain = {name: v if isinstance(v, bool | int | float | str) else str(v) for name, v in settings.items()}
+        self._writer.add_hparams(plain, dict(metrics), run_name=".")
+
+    def filter(self, filter: nn.Module, layout: Layout, step: int) -> None:
+        """The constrained noise of a filter: see `noise_scalars`."""
+        self.scalars(noise_scalars(filter, layout), step)
+
+    def close(self) -> None:
+        """Write everything out."""
+        self._writer.close()
+
+
+def noise_scalars(filter: nn.Module, layout: Layout) -> dict[str, float]:
+    """Constrained values of everything a filter can learn, by name.
+
+    - ``R/MODALITY``: geometric mean over its DoFs of the standard deviation, in its unit, and ``R_factor/DOF``
+      the variance relative to the start;
+    - ``R_phase/MODALITY/PHASE``: factor on the variance at that phase;
+    - ``Q/...``: acceleration of the phase (1/s^2) and rates of the weights (1/sqrt(s));
+    - ``localisation/A~B`` and ``inflation``.
+    """
+    values: dict[str, float] = {}
+    with torch.no_grad():
+        for module in filter.modules():
+            if isinstance(module, MeasurementNoise):
+                values |= _measurement(module, layout)
+            elif isinstance(module, PhaseNoise):
+                values["Q/phase_acceleration"] = float(module.acceleration.value)
+                values["Q/phase_coupling"] = float(module.coupling.value)
+                values["Q/phase_independent"] = float(module.independent.value)
+            elif isinstance(module, WeightNoise):
+                rates = zip(layout.names, module.rates.value.tolist(), strict=True)
+                values |= {f"Q/weights/{name}": rate for name, rate in rates}
+            elif isinstance(module, Localisation):
+                matrix = module.matrix
+                for i, first in enumerate(module.names):
+                    for j in range(i + 1, len(module.names)):
+                        values[f"localisation/{first}~{module.names[j]}"] = float(matrix[i, j])
+            elif isinstance(module, AboveOne):
+                values["inflation"] = float(module.value)
+    return values
+
+
+def _measurement(noise: MeasurementNoise, layout: Layout) -> dict[str, float]:
+    variance = noise.variance.value
+    factor = variance / noise.variance.start
+    values = {f"R_factor/{dof}": value for dof, value in zip(layout.dofs, factor.tolist(), strict=True)}
+    for modality in layout.modalities:
+        part = layout.slice(modality.name)
+        values[f"R/{modality.name}"] = float((0.5 * variance[part].log().mean()).exp())
+    if noise.context is not None:
+        phases = torch.linspace(0, 1, 5, dtype=variance.dtype, device=variance.device)
+        gates = noise.log_gate(phases).exp()
+        for i, modality in enumerate(layout.modalities):
+            for phase, gate in zip(phases.tolist(), gates[:, i].tolist(), strict=True):
+                values[f"R_phase/{modality.name}/{phase:.2f}"] = gate
+    return values

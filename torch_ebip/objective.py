@@ -1,0 +1,121 @@
+"""What tuning minimises: scores of forecasts made at many horizons."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torch_ebip.filters.base import Trace
+from torch_ebip.filters.ensemble import EnsembleFilter
+from torch_ebip.losses import CRPSLoss, ForwardKinematicsLoss, InnovationLikelihoodLoss, TrajectoryLoss
+from torch_ebip.primitive import InteractionPrimitive
+
+
+class Weights(NamedTuple):
+    """How much each term of the objective counts; a term of weight 0 is not computed.
+
+    Attributes:
+        crps: fair CRPS of the forecast ensemble, DoFs in units of their spread over the demonstrations:
+            accuracy and calibration.
+        squared_error: of the ensemble mean, in the same units squared.
+        tool: distance of the arm's tool in metres (needs an arm).
+        innovation: one-step negative log-likelihood of the measurements, nats a value.
+    """
+
+    crps: float = 1.0
+    squared_error: float = 1.0
+    tool: float = 0.0
+    innovation: float = 0.0
+
+
+class ForecastObjective(nn.Module):
+    """Scores the forecasts that a filter makes of some DoFs, from states kept at several horizons.
+
+    The target is an interaction's own regression, so it exists at every phase. Each DoF counts in units of its
+    standard deviation at phase 1 over the demonstrations.
+
+    Args:
+        primitive: of the demonstrations that are tuned on.
+        targets: bool [D], the DoFs to forecast.
+        phases: [P], where between now (0) and the end (1) the forecast is scored.
+        weights: of the terms.
+        arm: for the term ``tool``: a loss on its joints.
+        arm_dofs: bool [D], the joints of the arm, all of them targets.
+
+    Raises:
+        ValueError: no target, a target that never varies, or a tool term without an arm.
+    """
+
+    phases: Tensor
+
+    def __init__(
+        self,
+        primitive: InteractionPrimitive,
+        targets: Tensor,
+        phases: Tensor | None = None,
+        weights: Weights | None = None,
+        arm: ForwardKinematicsLoss | None = None,
+        arm_dofs: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        self.weights = Weights() if weights is None else weights
+        if self.weights.tool and (arm is None or arm_dofs is None):
+            raise ValueError("the tool term needs an arm and the DoFs that are its joints")
+        scale = primitive.end_variance.sqrt()[targets]
+        self.crps = CRPSLoss(scale)
+        self.squared_error = TrajectoryLoss(scale)
+        self.innovation = InnovationLikelihoodLoss()
+        self.arm = arm
+        self.arm_dofs = None if arm_dofs is None else arm_dofs[targets]
+        phases = scale.new_tensor([1 / 3, 2 / 3, 1.0]) if phases is None else phases.to(scale)
+        self.register_buffer("phases", phases)
+
+    def forward(
+        self, filter: EnsembleFilter, trace: Trace, observed: Tensor, truth: Tensor, now: Tensor, targets: Tensor
+    ) -> dict[str, Tensor]:
+        """Weighted terms by name; their sum is the loss.
+
+        Args:
+            filter: that made the trace.
+            trace: with states kept at K horizons, batch [B].
+            observed: bool [B, T, D'], what the filter was shown (D' DoFs of the filter).
+            truth: [B, K, P, D_targets], at `phases_ahead`.
+            now: [B, K], true phases of the horizons.
+            targets: bool [D'], the targets among the filter's DoFs.
+
+        Raises:
+            ValueError: the trace kept no states.
+        """
+        if trace.kept is None:
+            raise ValueError("the trace kept no states to forecast from")
+        members = filter.forecast_members(trace.kept, self.phases_ahead(now))[..., targets]
+        mean = members.mean(-2)
+        terms = {}
+        if self.weights.crps:
+            terms["crps"] = self.weights.crps * self.crps(members, truth)
+        if self.weights.squared_error:
+            terms["squared_error"] = self.weights.squared_error * self.squared_error(mean, truth)
+        if self.weights.tool and self.arm is not None:
+            joints, wanted = mean[..., -1, self.arm_dofs], truth[..., -1, self.arm_dofs]
+            terms["tool"] = self.weights.tool * self.arm(joints, wanted)
+        if self.weights.innovation:
+            terms["innovation"] = self.weights.innovation * self.innovation(trace.log_likelihood, observed)
+        return terms
+
+    def phases_ahead(self, now: Tensor) -> Tensor:
+        """Phases [..., P] that are scored from horizons now [...]."""
+        return now.unsqueeze(-1) + (1 - now.unsqueeze(-1)) * self.phases
+
+    def spread_and_error(self, filter: EnsembleFilter, trace: Trace, truth: Tensor, targets: Tensor) -> Tensor:
+        """[2]: root mean variance of the forecasts of phase 1 and root mean squared error of their mean.
+
+        Both in units of the targets' spread over the demonstrations; equal for a calibrated filter.
+        """
+        if trace.kept is None:
+            raise ValueError("the trace kept no states to forecast from")
+        end = torch.ones(1, dtype=truth.dtype, device=truth.device)
+        members = filter.forecast_members(trace.kept, end)[..., 0, :, :][..., targets] / self.crps.scale
+        error = members.mean(-2) - truth[..., -1, :] / self.crps.scale
+        return torch.stack([members.var(-2).mean().sqrt(), error.square().mean().sqrt()])

@@ -1,0 +1,311 @@
+"""Tuning the noise of an ensemble filter by gradient, on top of the closed form.
+
+Every training interaction is filtered by an ensemble that does not contain it, shown a random subset of its
+sensors up to random horizons, and the forecasts made there are scored. Everything random in a step follows from
+the seed and the number of the step, so a run that was interrupted continues to the same numbers.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torch_ebip.checkpoint import load_checkpoint, save_checkpoint
+from torch_ebip.demonstrations import Demonstrations
+from torch_ebip.filters.base import Trace
+from torch_ebip.filters.ebip import restrict
+from torch_ebip.filters.ensemble import EnsembleFilter
+from torch_ebip.monitor import Monitor
+from torch_ebip.objective import ForecastObjective
+from torch_ebip.primitive import InteractionPrimitive
+
+
+@dataclass(frozen=True)
+class TuningSettings:
+    """How to tune.
+
+    Attributes:
+        steps: gradient steps at most.
+        batch_size: interactions a step.
+        learning_rate: of Adam, on the logarithmic scale of all parameters; it falls along a half cosine.
+        horizons: smallest and largest share of an interaction that is shown.
+        horizons_each: horizons for each interaction of a batch.
+        folds: into how many parts the demonstrations are cut: an interaction's ensemble is the other parts.
+        n_members: E while tuning; default: all demonstrations of the other parts.
+        pull: weight of the mean squared distance from the starting point, per parameter group.
+        clip: largest norm of the gradient.
+        validation: share of the demonstrations that are kept for early stopping.
+        validate_every: steps between validations.
+        patience: validations without improvement before stopping.
+        segment: samples a segment of gradient checkpointing (exact); 0 for none.
+        only: shell patterns of the names of the parameters to tune.
+        seed: of everything random.
+    """
+
+    steps: int = 120
+    batch_size: int = 16
+    learning_rate: float = 0.1
+    horizons: tuple[float, float] = (0.2, 0.95)
+    horizons_each: int = 3
+    folds: int = 5
+    n_members: int | None = None
+    pull: float = 0.01
+    clip: float = 1.0
+    validation: float = 0.2
+    validate_every: int = 10
+    patience: int = 5
+    segment: int = 16
+    only: tuple[str, ...] = ("*",)
+    seed: int = 0
+
+
+class TuningResult(NamedTuple):
+    """How a tuning went: the step whose parameters were kept, validation loss by step, why it ended."""
+
+    best_step: int
+    validation: dict[int, float]
+    stopped_early: bool
+    seconds: float
+
+
+class Tuner:
+    """Tunes a filter made by `ebip` on the demonstrations that it is made of.
+
+    Args:
+        filter: changed in place; its prior's states are those of ``primitive``.
+        demonstrations: N of them, what ``primitive`` was fitted to.
+        primitive: for the targets.
+        objective: what is minimised.
+        targets: bool [D], the DoFs to forecast, the same that the objective knows.
+        subsets: the sensors that may be shown together, bool [D] each, by name; one is drawn for each step.
+        settings: how.
+        monitor: where to report; default: nowhere.
+        checkpoint: path of a file to continue from if it exists, and to write after each validation.
+        progress: called after each step with the step, the training loss and the last validation loss.
+
+    Raises:
+        ValueError: demonstrations that are not the prior's; fewer than two folds or too few demonstrations for
+            them; no parameter matches ``only``; a checkpoint of another configuration.
+    """
+
+    def __init__(
+        self,
+        filter: EnsembleFilter,
+        demonstrations: Demonstrations,
+        primitive: InteractionPrimitive,
+        objective: ForecastObjective,
+        targets: Tensor,
+        subsets: Mapping[str, Tensor],
+        settings: TuningSettings | None = None,
+        monitor: Monitor | None = None,
+        checkpoint: str | os.PathLike[str] | None = None,
+        progress: Callable[[int, float, float], None] | None = None,
+    ) -> None:
+        if len(primitive) != len(demonstrations):
+            raise ValueError(f"{len(demonstrations)} demonstrations, but the primitive has {len(primitive)}")
+        self.filter, self.primitive, self.objective = filter, primitive, objective
+        self.settings = TuningSettings() if settings is None else settings
+        self.targets, self.subsets = targets, dict(subsets)
+        self.monitor, self.progress = monitor, progress
+        self.checkpoint = None if checkpoint is None else Path(checkpoint)
+        self.layout = demonstrations.layout
+        self.values, self.observed = demonstrations.pad()
+        self.lengths = demonstrations.lengths
+        self.parameters = {
+            name: parameter
+            for name, parameter in filter.named_parameters()
+            if any(fnmatch(name, pattern) for pattern in self.settings.only)
+        }
+        if not self.parameters:
+            names = ", ".join(name for name, _ in filter.named_parameters())
+            raise ValueError(f"no parameter matches {self.settings.only}; there are {names}")
+        self._split(len(demonstrations))
+
+    def run(self) -> TuningResult:
+        """Tune, and leave the parameters of the best validation in the filter."""
+        settings, began = self.settings, time.monotonic()
+        optimizer = torch.optim.Adam(self.parameters.values(), lr=settings.learning_rate)
+        history: dict[int, float] = {}
+        best, start = self._snapshot(), 0
+        if self.checkpoint is not None and self.checkpoint.exists():
+            start, best, history = self._resume(optimizer)
+        if not history:
+            history[0] = self._validate(0)
+        waited = _waited(history)
+        step = start
+        while step < settings.steps and waited < settings.patience:
+            step += 1
+            loss = self._step(step, optimizer)
+            if step % settings.validate_every == 0 or step == settings.steps:
+                history[step] = self._validate(step)
+                if history[step] == min(history.values()):
+                    best = self._snapshot()
+                waited = _waited(history)
+                self._save(step, optimizer, best, history)
+            if self.progress is not None:
+                self.progress(step, loss, history[max(history)])
+        self._restore(best)
+        kept = min(history, key=lambda key: history[key])
+        return TuningResult(kept, history, step < settings.steps, time.monotonic() - began)
+
+    def _split(self, count: int) -> None:
+        """Validation interactions, training interactions, and for each the members of its ensemble."""
+        settings = self.settings
+        held = max(1, round(settings.validation * count))
+        if settings.folds < 2 or count - held < 1 or count < 2 * settings.folds:
+            raise ValueError(f"{count} demonstrations are too few for {settings.folds} folds and validation")
+        order = torch.randperm(count, generator=torch.Generator().manual_seed(settings.seed))
+        self.validating, self.training = order[:held], order[held:]
+        part = torch.empty(count, dtype=torch.long)
+        part[order] = torch.arange(count) % settings.folds
+        others = [(part != fold).nonzero().squeeze(-1) for fold in range(settings.folds)]
+        size = min(len(group) for group in others)
+        self._part, self._others = part, torch.stack([group[:size] for group in others])
+
+    def _members(self, interactions: Tensor, generator: torch.Generator) -> Tensor:
+        """Indices [B, E] of demonstrations outside each interaction's own fold."""
+        others = self._others[self._part[interactions]]
+        size = self.settings.n_members
+        if size is None or size == others.shape[1]:
+            return others
+        if size > others.shape[1]:
+            return others.gather(1, torch.randint(others.shape[1], (len(others), size), generator=generator))
+        return others.gather(1, torch.rand(others.shape, generator=generator).argsort(-1)[:, :size])
+
+    def _filter(
+        self, interactions: Tensor, subset: Tensor, shares: Tensor, generator: torch.Generator
+    ) -> tuple[EnsembleFilter, Trace, tuple[Any, ...]]:
+        """Filter some interactions [B], shown a subset [D] of sensors, up to shares [B, K] of their length."""
+        kept_dofs = subset | self.targets
+        part = restrict(self.filter, kept_dofs)
+        last = (self.lengths[interactions] - 1).unsqueeze(-1)
+        steps = (shares * last).round().long()
+        length = int(steps.max()) + 1
+        y = self.values[interactions, :length][..., kept_dofs]
+        observed = self.observed[interactions, :length][..., kept_dofs] & subset[kept_dofs]
+        observed = observed & (torch.arange(length).view(1, -1, 1) <= steps.amax(-1).view(-1, 1, 1))
+        state = part.initial_state((len(interactions),), self._members(interactions, generator), generator)
+        segment = self.settings.segment if torch.is_grad_enabled() else None
+        trace = part(
+            y, observed, state=state, generator=generator, keep=steps, segment=segment or None, project=False
+        )
+        now = (steps / last).to(y)
+        weights = self.primitive.weights[interactions, None, None, :]
+        truth = self.primitive.basis.project(self.objective.phases_ahead(now), weights)[..., self.targets]
+        return part, trace, (observed, truth, now, self.targets[kept_dofs])
+
+    def _step(self, step: int, optimizer: torch.optim.Optimizer) -> float:
+        settings, began = self.settings, time.monotonic()
+        generator = torch.Generator().manual_seed(_mix(settings.seed, step))
+        picked = torch.randperm(len(self.training), generator=generator)[: settings.batch_size]
+        name = list(self.subsets)[int(torch.randint(len(self.subsets), (), generator=generator))]
+        low, high = settings.horizons
+        draws = torch.rand(len(picked), settings.horizons_each, generator=generator)
+        part, trace, context = self._filter(
+            self.training[picked], self.subsets[name], low + (high - low) * draws, generator
+        )
+        terms = self.objective(part, trace, *context)
+        terms["pull"] = settings.pull * self._distance()
+        loss = torch.stack(list(terms.values())).sum()
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        norm = float(nn.utils.clip_grad_norm_(self.parameters.values(), settings.clip, error_if_nonfinite=True))
+        for group in optimizer.param_groups:
+            group["lr"] = settings.learning_rate * 0.5 * (1 + math.cos(math.pi * step / (settings.steps + 1)))
+        optimizer.step()
+        if self.monitor is not None:
+            samples = int(context[0].any(-1).sum())
+            scalars = {f"train/{key}": float(value) for key, value in terms.items()}
+            scalars |= {"train/loss": float(loss), f"train_subset/{name}": float(loss), "gradient/norm": norm}
+            scalars["throughput/samples_per_second"] = samples / (time.monotonic() - began)
+            for key, parameter in self.parameters.items():
+                if parameter.grad is not None:
+                    scalars[f"gradient/{key}"] = float(parameter.grad.norm())
+            self.monitor.scalars(scalars, step)
+        return float(loss)
+
+    @torch.no_grad()
+    def _validate(self, step: int) -> float:
+        """Mean loss of the validation interactions over all subsets, always at the same horizons and draws."""
+        low, high = self.settings.horizons
+        shares = low + (high - low) * (torch.arange(4) + 0.5) / 4
+        totals: dict[str, list[float]] = {}
+        spreads = []
+        for name, subset in self.subsets.items():
+            generator = torch.Generator().manual_seed(_mix(self.settings.seed, -1))
+            part, trace, context = self._filter(
+                self.validating, subset, shares.expand(len(self.validating), -1), generator
+            )
+            terms = self.objective(part, trace, *context)
+            for key, value in terms.items():
+                totals.setdefault(key, []).append(float(value))
+            totals.setdefault(f"subset/{name}", []).append(sum(float(value) for value in terms.values()))
+            spreads.append(self.objective.spread_and_error(part, trace, context[1], context[3]))
+        means = {key: sum(values) / len(values) for key, values in totals.items()}
+        loss = sum(value for key, value in means.items() if not key.startswith("subset/"))
+        if self.monitor is not None:
+            spread, error = torch.stack(spreads).square().mean(0).sqrt().tolist()
+            scalars = {f"validation/{key}": value for key, value in means.items()}
+            scalars |= {"validation/loss": loss, "calibration/spread": spread, "calibration/error": error}
+            scalars["calibration/spread_over_error"] = spread / error
+            self.monitor.scalars(scalars, step)
+            self.monitor.filter(self.filter, self.layout, step)
+        return loss
+
+    def _distance(self) -> Tensor:
+        """Mean squared distance from the start within each parameter, summed over parameters."""
+        return torch.stack([parameter.square().mean() for parameter in self.parameters.values()]).sum()
+
+    def _configuration(self) -> dict[str, Any]:
+        settings = {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(self.settings).items()}
+        shapes: Sequence[str] = [f"{name} {list(p.shape)}" for name, p in self.parameters.items()]
+        interactions = int(self.lengths.sum())
+        return {**settings, "parameters": list(shapes), "samples": interactions, "subsets": list(self.subsets)}
+
+    def _snapshot(self) -> dict[str, Tensor]:
+        return {name: parameter.detach().clone() for name, parameter in self.parameters.items()}
+
+    def _restore(self, values: Mapping[str, Tensor]) -> None:
+        with torch.no_grad():
+            for name, parameter in self.parameters.items():
+                parameter.copy_(values[name])
+
+    def _save(
+        self, step: int, optimizer: torch.optim.Optimizer, best: Mapping[str, Tensor], history: Mapping[int, float]
+    ) -> None:
+        if self.checkpoint is not None:
+            content = {
+                "step": step,
+                "parameters": self._snapshot(),
+                "best": dict(best),
+                "optimizer": optimizer.state_dict(),
+                "validation": dict(history),
+            }
+            save_checkpoint(self.checkpoint, self._configuration(), content)
+
+    def _resume(self, optimizer: torch.optim.Optimizer) -> tuple[int, dict[str, Tensor], dict[int, float]]:
+        assert self.checkpoint is not None
+        content = load_checkpoint(self.checkpoint, self._configuration())
+        self._restore(content["parameters"])
+        optimizer.load_state_dict(content["optimizer"])
+        return content["step"], content["best"], content["validation"]
+
+
+def _waited(history: Mapping[int, float]) -> int:
+    """How many validations ago the best one was."""
+    best = min(history, key=lambda key: history[key])
+    return sum(1 for step in history if step > best)
+
+
+def _mix(seed: int, step: int) -> int:
+    """A seed of its own for each step; neighbouring steps and seeds do not share streams."""
+    return (seed * 1_000_003 + step * 7_919 + 17) % (2**63)
