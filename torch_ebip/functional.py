@@ -7,6 +7,9 @@ Andrews (1968). Members are rows, as everywhere in this package.
 Shapes: ``...`` batch, E members, n state, D observation. An unmeasured row leaves S, the gain and the likelihood
 untouched: rows that no entry of the batch measured are cut out, the others are masked before the arithmetic, so
 neither their values nor their gradients can reach anything.
+
+Members may carry weights [..., E] that sum to 1: then means and covariances are weighted, the latter by
+w_j / (1 - sum w^2), which is 1 / (E - 1) for equal ones.
 """
 
 from __future__ import annotations
@@ -44,6 +47,7 @@ class _Innovation(NamedTuple):
     rows: Tensor | None  # int64, the columns that were kept; None for all
     scale: Tensor  # [..., D], square root of the diagonal of S
     anomalies: Tensor  # HA / scale, [..., E, D]
+    weighted: Tensor  # the same, each row times its share in a covariance
     residual: Tensor  # (y - mean HX) / scale, [..., D]; 0 where unmeasured
     cholesky: Tensor  # of S in those units, [..., D, D]
     noise: Tensor  # rows of the factor of R in those units, [..., D, D_all]
@@ -58,6 +62,7 @@ def ensemble_update(
     perturbations: Tensor,
     observed: Tensor | None = None,
     taper: Taper | None = None,
+    weights: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Stochastic ensemble Kalman update, X + K (y + eps - HX).
 
@@ -69,6 +74,7 @@ def ensemble_update(
         perturbations: standard-normal draws, [..., E, D]; scaled inside by the Cholesky factor.
         observed: bool [..., D]; default: everything.
         taper: localisation; default: none.
+        weights: of the members, [..., E], summing to 1; default: equal.
 
     Returns:
         The updated members [..., E, n] and the log-likelihood [...] of y under N(mean HX, S).
@@ -83,7 +89,7 @@ def ensemble_update(
             f"perturbations must be [..., {projections.shape[-2]}, {projections.shape[-1]}] as the projections, "
             f"got {tuple(perturbations.shape)}"
         )
-    innovation = _innovation(projections, y, noise_cholesky, observed, taper)
+    innovation = _innovation(projections, y, noise_cholesky, observed, taper, weights)
     if innovation is None:
         return _nothing_observed(members, projections, y)
     noise = perturbations @ innovation.noise.transpose(-1, -2)
@@ -91,7 +97,7 @@ def ensemble_update(
     if innovation.observed is not None:
         departures = departures * innovation.observed.unsqueeze(-2)
     solved = torch.cholesky_solve(departures.transpose(-1, -2), innovation.cholesky).transpose(-1, -2)
-    increment = _through_gain(solved, members, innovation, taper)
+    increment = _through_gain(solved, members, innovation, taper, weights)
     return members + increment, _log_likelihood(innovation)
 
 
@@ -102,6 +108,7 @@ def square_root_update(
     noise_cholesky: Tensor,
     observed: Tensor | None = None,
     taper: Taper | None = None,
+    weights: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Deterministic update whose analysis covariance is the Kalman posterior of the ensemble's own covariance.
 
@@ -114,7 +121,7 @@ def square_root_update(
     Arguments, returns and errors as `ensemble_update`, without perturbations.
     """
     _check(members, projections, y, noise_cholesky, observed)
-    innovation = _innovation(projections, y, noise_cholesky, observed, taper)
+    innovation = _innovation(projections, y, noise_cholesky, observed, taper, weights)
     if innovation is None:
         return _nothing_observed(members, projections, y)
     V = innovation.cholesky
@@ -125,13 +132,37 @@ def square_root_update(
     shift = torch.cholesky_solve(innovation.residual.unsqueeze(-1), V).transpose(-1, -2)
     shrink = torch.linalg.solve_triangular(V + U, innovation.anomalies.transpose(-1, -2), upper=False)
     shrink = torch.linalg.solve_triangular(V.transpose(-1, -2), shrink, upper=True).transpose(-1, -2)
-    increment = _through_gain(shift - shrink, members, innovation, taper)
+    increment = _through_gain(shift - shrink, members, innovation, taper, weights)
     return members + increment, _log_likelihood(innovation)
 
 
-def inflate(members: Tensor, factor: Tensor | float) -> Tensor:
+def ensemble_mean(members: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Mean [..., n] of members [..., E, n] with weights [..., E] that sum to 1; default: equal ones."""
+    return members.mean(-2) if weights is None else (weights.unsqueeze(-2) @ members).squeeze(-2)
+
+
+def ensemble_variance(members: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Unbiased variance [..., n] of members [..., E, n] with weights [..., E]; default: equal ones."""
+    anomalies = members - ensemble_mean(members, weights).unsqueeze(-2)
+    return (anomalies.square() * _shares(members, weights)).sum(-2)
+
+
+def ensemble_covariance(members: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Unbiased covariance [..., n, n] of members [..., E, n] with weights [..., E]; default: equal ones."""
+    anomalies = members - ensemble_mean(members, weights).unsqueeze(-2)
+    return (anomalies * _shares(members, weights)).transpose(-1, -2) @ anomalies
+
+
+def _shares(members: Tensor, weights: Tensor | None) -> Tensor:
+    """What each member's squared anomaly counts in a covariance, [..., E, 1] or [1]."""
+    if weights is None:
+        return members.new_tensor([1 / (members.shape[-2] - 1)])
+    return (weights / (1 - weights.square().sum(-1, keepdim=True))).unsqueeze(-1)
+
+
+def inflate(members: Tensor, factor: Tensor | float, weights: Tensor | None = None) -> Tensor:
     """Scale the deviations from the mean of members [..., E, n] by a factor [...] (covariance by its square)."""
-    mean = members.mean(-2, keepdim=True)
+    mean = ensemble_mean(members, weights).unsqueeze(-2)
     scale = torch.as_tensor(factor, dtype=members.dtype, device=members.device)
     return mean + (members - mean) * scale[..., None, None]
 
@@ -152,7 +183,12 @@ def _check(members: Tensor, projections: Tensor, y: Tensor, noise_cholesky: Tens
 
 
 def _innovation(
-    projections: Tensor, y: Tensor, noise_cholesky: Tensor, observed: Tensor | None, taper: Taper | None
+    projections: Tensor,
+    y: Tensor,
+    noise_cholesky: Tensor,
+    observed: Tensor | None,
+    taper: Taper | None,
+    weights: Tensor | None,
 ) -> _Innovation | None:
     """Whitened innovation statistics over the measured rows; None if no entry of the batch measured any."""
     rows = None
@@ -166,8 +202,7 @@ def _innovation(
             noise_cholesky = noise_cholesky.index_select(-2, rows)
         if bool(observed.all()):
             observed = None
-    E = projections.shape[-2]
-    mean = projections.mean(-2)
+    mean = ensemble_mean(projections, weights)
     anomalies = projections - mean.unsqueeze(-2)
     noise = noise_cholesky
     if observed is not None:
@@ -175,7 +210,8 @@ def _innovation(
         noise = torch.where(observed.unsqueeze(-1), noise, 0)
         y = torch.where(observed, y, 0)
         mean = torch.where(observed, mean, 0)
-    variance = anomalies.square().sum(-2) / (E - 1) + noise.square().sum(-1)
+    shares = _shares(projections, weights)
+    variance = (anomalies.square() * shares).sum(-2) + noise.square().sum(-1)
     if observed is not None:
         variance = torch.where(observed, variance, 1)
     scale = variance.sqrt()
@@ -183,7 +219,8 @@ def _innovation(
     # many orders of magnitude can be factored together in float32.
     anomalies = anomalies / scale.unsqueeze(-2)
     noise = noise / scale.unsqueeze(-1)
-    covariance = anomalies.transpose(-1, -2) @ anomalies / (E - 1)
+    weighted = anomalies * shares
+    covariance = weighted.transpose(-1, -2) @ anomalies
     if taper is not None:
         factor = taper.observation
         if rows is not None:
@@ -192,10 +229,12 @@ def _innovation(
     S = covariance + noise @ noise.transpose(-1, -2)
     if observed is not None:
         S = S + torch.diag_embed((~observed).to(S))
-    return _Innovation(rows, scale, anomalies, (y - mean) / scale, _cholesky(S, rows), noise, observed)
+    return _Innovation(rows, scale, anomalies, weighted, (y - mean) / scale, _cholesky(S, rows), noise, observed)
 
 
-def _through_gain(solved: Tensor, members: Tensor, innovation: _Innovation, taper: Taper | None) -> Tensor:
+def _through_gain(
+    solved: Tensor, members: Tensor, innovation: _Innovation, taper: Taper | None, weights: Tensor | None
+) -> Tensor:
     """Rows [..., E, D] that already went through S^-1, times (HA)' A / (E - 1): increments [..., E, n].
 
     With E members, D rows and n states the products cost 4 nED from the left of the members, 2 nE^2 + 2 E^2 D
@@ -203,11 +242,11 @@ def _through_gain(solved: Tensor, members: Tensor, innovation: _Innovation, tape
     """
     E, n = members.shape[-2:]
     D = solved.shape[-1]
-    anomalies = members - members.mean(-2, keepdim=True)
-    scaled = innovation.anomalies / (E - 1)
+    anomalies = members - ensemble_mean(members, weights).unsqueeze(-2)
+    weighted = innovation.weighted.transpose(-1, -2)
     if taper is None and 4 * n * D > 2 * n * E + 2 * E * D:
-        return solved @ scaled.transpose(-1, -2) @ anomalies
-    cross = scaled.transpose(-1, -2) @ anomalies
+        return solved @ weighted @ anomalies
+    cross = weighted @ anomalies
     if taper is not None:
         factor = taper.state.transpose(-1, -2)
         cross = cross * (factor if innovation.rows is None else factor.index_select(-2, innovation.rows))

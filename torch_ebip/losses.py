@@ -47,10 +47,10 @@ class TrajectoryLoss(nn.Module):
 class CRPSLoss(TrajectoryLoss):
     """Mean fair CRPS of an ensemble forecast in units of each DoF's scale; arguments as `TrajectoryLoss`."""
 
-    def forward(self, predicted: Tensor, target: Tensor) -> Tensor:
-        """Members [..., E, D] and target [..., D] -> scalar, without unit."""
+    def forward(self, predicted: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
+        """Members [..., E, D], target [..., D] and weights [..., E] (default: equal) -> scalar, without unit."""
         members, target, measured = self._scaled(predicted, target)
-        return crps(members, target).mul(measured).sum() / measured.sum().clamp(min=1)
+        return crps(members, target, weights).mul(measured).sum() / measured.sum().clamp(min=1)
 
 
 class EnergyScoreLoss(TrajectoryLoss):

@@ -28,9 +28,9 @@ def coverage_95(forecast: Forecast, target: Tensor) -> Tensor:
     return inside.to(target.dtype).where(~target.isnan(), target).nanmean(-1)
 
 
-def crps(members: Tensor, target: Tensor) -> Tensor:
-    """Fair CRPS averaged over DoFs: members [..., E, D], target [..., D] -> [...], units of the DoFs."""
-    return ensemble_crps(members, target).nanmean(-1)
+def crps(members: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Fair CRPS averaged over DoFs: members [..., E, D], target [..., D], weights [..., E] -> [...], DoFs' units."""
+    return ensemble_crps(members, target, weights).nanmean(-1)
 
 
 def phase_error(phase: Tensor, true_phase: Tensor) -> Tensor:

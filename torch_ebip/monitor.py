@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import nn
 
+from torch_ebip.filters.evidence import EvidenceWeighting
 from torch_ebip.filters.localisation import Localisation
 from torch_ebip.layout import Layout
 from torch_ebip.noise import AboveOne, MeasurementNoise, PhaseNoise, WeightNoise
@@ -72,7 +73,7 @@ def noise_scalars(filter: nn.Module, layout: Layout) -> dict[str, float]:
       the variance relative to the start;
     - ``R_phase/MODALITY/PHASE``: factor on the variance at that phase;
     - ``Q/...``: acceleration of the phase (1/s^2) and rates of the weights (1/sqrt(s));
-    - ``localisation/A~B`` and ``inflation``.
+    - ``localisation/A~B``, ``inflation`` and ``weighting/...``, see `EvidenceWeighting`.
     """
     values: dict[str, float] = {}
     with torch.no_grad():
@@ -91,6 +92,12 @@ def noise_scalars(filter: nn.Module, layout: Layout) -> dict[str, float]:
                 for i, first in enumerate(module.names):
                     for j in range(i + 1, len(module.names)):
                         values[f"localisation/{first}~{module.names[j]}"] = float(matrix[i, j])
+            elif isinstance(module, EvidenceWeighting):
+                values["weighting/sharpness"] = float(module.sharpness.value)
+                values["weighting/forgetting"] = float(module.forgetting.value)
+                values["weighting/slope"] = float(module.slope.value)
+                factors = zip(layout.names, module.factor.value.tolist(), strict=True)
+                values |= {f"weighting/factor/{name}": factor for name, factor in factors}
             elif isinstance(module, AboveOne):
                 values["inflation"] = float(module.value)
     return values

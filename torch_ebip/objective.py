@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from torch_ebip.filters.base import Trace
 from torch_ebip.filters.ensemble import EnsembleFilter
+from torch_ebip.functional import ensemble_mean, ensemble_variance
 from torch_ebip.losses import CRPSLoss, ForwardKinematicsLoss, InnovationLikelihoodLoss, TrajectoryLoss
 from torch_ebip.primitive import InteractionPrimitive
 
@@ -91,10 +92,11 @@ class ForecastObjective(nn.Module):
         if trace.kept is None:
             raise ValueError("the trace kept no states to forecast from")
         members = filter.forecast_members(trace.kept, self.phases_ahead(now))[..., targets]
-        mean = members.mean(-2)
+        weights = None if trace.kept.weights is None else trace.kept.weights.unsqueeze(-2)
+        mean = ensemble_mean(members, weights)
         terms = {}
         if self.weights.crps:
-            terms["crps"] = self.weights.crps * self.crps(members, truth)
+            terms["crps"] = self.weights.crps * self.crps(members, truth, weights)
         if self.weights.squared_error:
             terms["squared_error"] = self.weights.squared_error * self.squared_error(mean, truth)
         if self.weights.tool and self.arm is not None:
@@ -117,5 +119,6 @@ class ForecastObjective(nn.Module):
             raise ValueError("the trace kept no states to forecast from")
         end = torch.ones(1, dtype=truth.dtype, device=truth.device)
         members = filter.forecast_members(trace.kept, end)[..., 0, :, :][..., targets] / self.crps.scale
-        error = members.mean(-2) - truth[..., -1, :] / self.crps.scale
-        return torch.stack([members.var(-2).mean().sqrt(), error.square().mean().sqrt()])
+        error = ensemble_mean(members, trace.kept.weights) - truth[..., -1, :] / self.crps.scale
+        variance = ensemble_variance(members, trace.kept.weights)
+        return torch.stack([variance.mean().sqrt(), error.square().mean().sqrt()])

@@ -6,14 +6,15 @@ import torch
 from torch import Tensor
 
 
-def crps(members: Tensor, target: Tensor) -> Tensor:
-    """Continuous ranked probability score, fair for finite ensembles (Ferro 2014).
+def crps(members: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Continuous ranked probability score, fair for finite ensembles (Ferro 2014), in O(E log E) by sorting.
 
-    mean_j |x_j - y| - sum_jk |x_j - x_k| / (2 E (E - 1)), in O(E log E) by sorting.
+    sum_j w_j |x_j - y| - sum_jk w_j w_k |x_j - x_k| / (2 (1 - sum_j w_j^2)).
 
     Args:
         members: [..., E, D], E >= 2.
         target: [..., D].
+        weights: of the members, [..., E], summing to 1; default: equal.
 
     Returns:
         [..., D], units of the DoFs; smaller is better.
@@ -21,10 +22,16 @@ def crps(members: Tensor, target: Tensor) -> Tensor:
     E = members.shape[-2]
     if E < 2:
         raise ValueError(f"a score of an ensemble needs at least 2 members, got {E}")
-    ordered = members.sort(dim=-2).values
-    ranks = torch.arange(1, E + 1, dtype=members.dtype, device=members.device).unsqueeze(-1)
-    spread = ((2 * ranks - E - 1) * ordered).sum(-2) / (E * (E - 1))
-    return (members - target.unsqueeze(-2)).abs().mean(-2) - spread
+    if weights is None:
+        weights = members.new_full(members.shape[-2:-1], 1 / E)
+    shares = weights.unsqueeze(-1).expand(members.shape)
+    ordered, order = members.sort(dim=-2)
+    sorted_shares = shares.gather(-2, order)
+    below = sorted_shares.cumsum(-2) - sorted_shares / 2
+    # Half of sum_jk w_j w_k |x_j - x_k| is sum_j w_j x_(j) (2 W_j - 1), W_j the weight up to the middle of j.
+    spread = (sorted_shares * (2 * below - 1) * ordered).sum(-2)
+    error = (shares * (members - target.unsqueeze(-2)).abs()).sum(-2)
+    return error - spread / (1 - weights.square().sum(-1, keepdim=True))
 
 
 def energy_score(members: Tensor, target: Tensor) -> Tensor:

@@ -3,6 +3,7 @@
 from torch_ebip.filters.base import Filter, Forecast, Trace
 from torch_ebip.filters.ebip import ebip
 from torch_ebip.filters.ensemble import EnsembleFilter, EnsembleState, FilterNoise
+from torch_ebip.filters.evidence import Evidence, EvidenceWeighting
 from torch_ebip.filters.interaction import BasisProjection, ConstantVelocityPhase
 from torch_ebip.filters.localisation import Localisation
 from torch_ebip.filters.priors import DemonstrationPrior, GaussianPrior
@@ -13,6 +14,8 @@ __all__ = [
     "DemonstrationPrior",
     "EnsembleFilter",
     "EnsembleState",
+    "Evidence",
+    "EvidenceWeighting",
     "Filter",
     "FilterNoise",
     "Forecast",

@@ -174,6 +174,8 @@ class Filter(nn.Module, ABC):
         batch, length = y.shape[:-2], y.shape[-2]
         if state is None:
             state = self.initial_state(batch, generator=generator)
+        elif state[0].shape[: len(batch)] != batch:
+            raise ValueError(f"the state's batch does not begin with {list(batch)}: {list(state[0].shape)}")
         if keep is not None and (keep.shape[:-1] != batch or int(keep.min()) < 0 or int(keep.max()) >= length):
             raise ValueError(f"keep must be [{', '.join(map(str, batch))}, K] with steps 0..{length - 1}, got {keep}")
         step = torch.as_tensor(self.dt if dt is None else dt).to(state[0])
@@ -188,7 +190,7 @@ class Filter(nn.Module, ABC):
                 record.phase.append(self.phase(state).expand(batch))
                 record.projection.append(self.project(state) if project else state[0].new_zeros(*batch, 0))
                 if keep is not None:
-                    record.kept.extend(_pick(state, keep == t, batch))
+                    record.kept.extend(_pick(state, keep == t))
             return record._replace(state=state)
 
         segments = []
@@ -254,19 +256,32 @@ def _checkpointed(
     return done  # type: ignore[no-any-return]
 
 
-def _pick(state: State, here: Tensor, batch: torch.Size) -> list[tuple[tuple[int, ...], State]]:
+def _pick(state: State, here: Tensor) -> list[tuple[tuple[int, ...], State]]:
     """The entries of a batch that are to be kept now, with their place [*batch, K]."""
     if not bool(here.any()):
         return []
     places = [tuple(index) for index in here.nonzero().tolist()]
-    return [(place, type(state)(*(_entry(part, place[:-1], batch) for part in state))) for place in places]
 
+    def entry(index: tuple[int, ...], part: Tensor) -> Tensor:
+        return part[index]
 
-def _entry(part: Tensor, index: tuple[int, ...], batch: torch.Size) -> Tensor:
-    return part.expand(*batch, *part.shape[len(batch) :])[index]
+    return [(place, map_state(partial(entry, place[:-1]), state)) for place in places]
 
 
 def _assemble(picked: list[tuple[tuple[int, ...], State]], shape: torch.Size) -> State:
     ordered = [state for _, state in sorted(picked, key=lambda pair: pair[0])]
-    fields = (torch.stack(parts) for parts in zip(*ordered, strict=True))
-    return type(ordered[0])(*(field.reshape(*shape, *field.shape[1:]) for field in fields))
+
+    def stack(*parts: Tensor) -> Tensor:
+        return torch.stack(parts).reshape(*shape, *parts[0].shape)
+
+    return map_state(stack, *ordered)
+
+
+def map_state(function: Callable[..., Tensor], *states: State) -> State:
+    """Apply a function to the corresponding tensors of states, which may be nested and hold None."""
+    first = states[0]
+    if first is None:
+        return None
+    if isinstance(first, Tensor):
+        return function(*states)
+    return type(first)(*(map_state(function, *parts) for parts in zip(*states, strict=True)))

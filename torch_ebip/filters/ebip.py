@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from torch_ebip.basis.base import Basis
 from torch_ebip.filters.ensemble import EnsembleFilter, FilterNoise
+from torch_ebip.filters.evidence import EvidenceWeighting
 from torch_ebip.filters.interaction import BasisProjection, ConstantVelocityPhase
 from torch_ebip.filters.localisation import Localisation
 from torch_ebip.filters.priors import DemonstrationPrior
@@ -27,6 +28,7 @@ def ebip(
     localise: bool = False,
     inflation: float | nn.Module | None = None,
     square_root: bool = False,
+    weigh: bool = False,
 ) -> EnsembleFilter:
     """The paper's eBIP (Section IV): members are demonstrations, R is the closed form.
 
@@ -42,6 +44,7 @@ def ebip(
         localise: learn factors between modalities; see `Localisation`.
         inflation: of the anomalies; see `EnsembleFilter`.
         square_root: deterministic update.
+        weigh: weigh members by the evidence for their demonstrations; see `EvidenceWeighting`.
 
     Returns:
         A filter with parameters of its own, in the dtype and on the device of the primitive.
@@ -75,7 +78,8 @@ def ebip(
         square_root,
         inflation,
         localisation,
-        layout.dofs,
+        EvidenceWeighting(primitive.value_variance, modality_of_dof) if weigh else None,
+        dof_names=layout.dofs,
     )
 
 
@@ -90,11 +94,16 @@ def _acceleration(primitive: InteractionPrimitive) -> Tensor:
     return 0.1 * spread * (primitive.rate * velocity.mean()).sqrt()
 
 
-def restrict(whole: EnsembleFilter, dofs: Tensor) -> EnsembleFilter:
+def restrict(whole: EnsembleFilter, dofs: Tensor, thinning: int = 1) -> EnsembleFilter:
     """The same eBIP filter for some of the DoFs, bool [D], sharing its parameters: not a copy.
 
     DoFs that are neither measured nor asked for influence nothing, so leaving out their weights is exact, and
     it saves their share of every update.
+
+    Args:
+        whole: made by `ebip`.
+        dofs: bool [D], those to keep.
+        thinning: see `EnsembleFilter`; the time between samples grows with it.
 
     Raises:
         TypeError: the filter is not an eBIP.
@@ -117,10 +126,13 @@ def restrict(whole: EnsembleFilter, dofs: Tensor) -> EnsembleFilter:
         prior.select(state),
         whole.n_members,
         len(index),
-        whole.dt,
+        whole.dt * thinning,
         whole.square_root,
         whole.inflation,
         None if localisation is None else localisation.select(state, index.to(weights.device)),
+        whole.weighting,
+        thinning,
         None if names is None else tuple(names[i] for i in index.tolist()),
     )
+    part.columns = index.to(weights.device)
     return part.train(whole.training)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -10,24 +11,35 @@ from torch import Tensor, nn
 
 from torch_ebip import functional
 from torch_ebip.filters.base import Filter, Forecast
+from torch_ebip.filters.evidence import Evidence, EvidenceWeighting
 from torch_ebip.filters.localisation import Localisation
 
 
 class EnsembleState(NamedTuple):
-    """An ensemble: members [..., E, n]."""
+    """An ensemble.
+
+    Attributes:
+        members: [..., E, n].
+        evidence: what weights of the members rest on; None where all count alike.
+    """
 
     members: Tensor
+    evidence: Evidence | None = None
+
+    @property
+    def weights(self) -> Tensor | None:
+        """[..., E], summing to 1; None where all members count alike."""
+        return None if self.evidence is None else self.evidence.weights
 
     @property
     def mean(self) -> Tensor:
         """[..., n]."""
-        return self.members.mean(-2)
+        return functional.ensemble_mean(self.members, self.weights)
 
     @property
     def covariance(self) -> Tensor:
-        """[..., n, n], A'A / (E - 1)."""
-        anomalies = self.members - self.members.mean(-2, keepdim=True)
-        return anomalies.transpose(-1, -2) @ anomalies / (self.members.shape[-2] - 1)
+        """[..., n, n], A'A / (E - 1), or its weighted form."""
+        return functional.ensemble_covariance(self.members, self.weights)
 
 
 class FilterNoise(nn.Module):
@@ -60,6 +72,10 @@ class EnsembleFilter(Filter):
         inflation: factor on the anomalies after each update that measured something; a number, or a
             module with a ``value`` such as `AboveOne` to learn it.
         localisation: factors on the cross-covariances of blocks of the state.
+        weighting: weigh members by the evidence for the demonstrations they came from; default: all alike.
+            Needs a state of phase, phase velocity and weights.
+        thinning: how many samples each one given stands for: R is divided by it and inflation raised to its
+            power. For sequences of which only every k-th sample is used.
         dof_names: for error messages.
 
     Raises:
@@ -78,6 +94,8 @@ class EnsembleFilter(Filter):
         square_root: bool = False,
         inflation: float | nn.Module | None = None,
         localisation: Localisation | None = None,
+        weighting: EvidenceWeighting | None = None,
+        thinning: int = 1,
         dof_names: tuple[str, ...] | None = None,
     ) -> None:
         super().__init__(dt, n_dofs)
@@ -91,6 +109,9 @@ class EnsembleFilter(Filter):
         self.square_root = square_root
         self.inflation = inflation
         self.localisation = localisation
+        self.weighting = weighting
+        self.thinning = thinning
+        self.columns: Tensor | None = None
         self.dof_names = dof_names
 
     def initial_state(
@@ -100,36 +121,52 @@ class EnsembleFilter(Filter):
         generator: torch.Generator | None = None,
     ) -> EnsembleState:
         """Step 1 of the paper's algorithm; see `Filter.initial_state`."""
-        return EnsembleState(self.prior(batch_shape, self.n_members, members, generator))
+        started = self.prior(batch_shape, self.n_members, members, generator)
+        return EnsembleState(started, None if self.weighting is None else self.weighting.start(started))
 
     def _predict(self, state: EnsembleState, dt: Tensor, generator: torch.Generator | None) -> EnsembleState:
         """Step 2: x = g(x) + N(0, Q)."""
-        return EnsembleState(self.noise.process(self.dynamics(state.members, dt), dt, generator))
+        evidence = state.evidence
+        if self.weighting is not None and evidence is not None:
+            evidence = self.weighting.forget(evidence, dt)
+        return EnsembleState(self.noise.process(self.dynamics(state.members, dt), dt, generator), evidence)
 
     def _update(
         self, state: EnsembleState, y: Tensor, observed: Tensor, generator: torch.Generator | None
     ) -> tuple[EnsembleState, Tensor]:
         """Step 3: x = x + K (y + eps - h(x))."""
-        members = state.members
+        members, weights = state.members, state.weights
         projections = self.observation(members)
-        factor = torch.diag_embed(self.noise.measurement(self._phase_or_none(members)))
+        deviation = self.noise.measurement(self._phase_or_none(state)) / math.sqrt(self.thinning)
+        factor = torch.diag_embed(deviation)
         taper = None if self.localisation is None else self.localisation()
         try:
             if self.square_root:
-                updated, likelihood = functional.square_root_update(members, projections, y, factor, observed, taper)
+                updated, likelihood = functional.square_root_update(
+                    members, projections, y, factor, observed, taper, weights
+                )
             else:
                 draws = torch.randn(
                     projections.shape, generator=generator, dtype=members.dtype, device=members.device
                 )
                 updated, likelihood = functional.ensemble_update(
-                    members, projections, y, factor, draws, observed, taper
+                    members, projections, y, factor, draws, observed, taper, weights
                 )
         except functional.FactorisationError as error:
             names = "" if self.dof_names is None else f" ({', '.join(self.dof_names[i] for i in error.dofs)})"
             raise ValueError(f"{error}{names}") from error
         if self.inflation is not None:
-            updated = functional.inflate(updated, torch.where(observed.any(-1), self._inflation_factor(members), 1))
-        return EnsembleState(updated), likelihood
+            grown = torch.where(observed.any(-1), self._inflation_factor(members) ** self.thinning, 1)
+            updated = functional.inflate(updated, grown, weights)
+        return EnsembleState(updated, self._weigh(state.evidence, updated, y, observed)), likelihood
+
+    def _weigh(self, evidence: Evidence | None, members: Tensor, y: Tensor, observed: Tensor) -> Evidence | None:
+        """Take a sample in as evidence for the demonstrations that the members came from."""
+        if self.weighting is None or evidence is None:
+            return evidence
+        projections = self.observation(torch.cat([members[..., :2], evidence.origin], dim=-1))
+        phase = functional.ensemble_mean(members[..., :1], evidence.weights).squeeze(-1)
+        return self.weighting.learn(evidence, projections, y, observed, phase, self.columns)
 
     def _inflation_factor(self, members: Tensor) -> Tensor:
         value = self.inflation.value if isinstance(self.inflation, nn.Module) else self.inflation
@@ -137,17 +174,18 @@ class EnsembleFilter(Filter):
 
     def project(self, state: EnsembleState) -> Tensor:
         """See `Filter.project`."""
-        mean: Tensor = self.observation(state.members).mean(-2)
-        return mean
+        return functional.ensemble_mean(self.observation(state.members), state.weights)
 
     def phase(self, state: EnsembleState) -> Tensor:
         """See `Filter.phase`."""
-        phase = self._phase_or_none(state.members)
+        phase = self._phase_or_none(state)
         return state.members[..., 0, 0] * torch.nan if phase is None else phase
 
-    def _phase_or_none(self, members: Tensor) -> Tensor | None:
+    def _phase_or_none(self, state: EnsembleState) -> Tensor | None:
         phase_of: Callable[[Tensor], Tensor] | None = getattr(self.observation, "phase", None)
-        return None if phase_of is None else phase_of(members)
+        if phase_of is None:
+            return None
+        return functional.ensemble_mean(phase_of(state.members).unsqueeze(-1), state.weights).squeeze(-1)
 
     def forecast_members(self, state: EnsembleState, phase: Tensor) -> Tensor:
         """Each member's trajectory, [..., P, E, D], at phases [P] or [..., P].
@@ -171,4 +209,6 @@ class EnsembleFilter(Filter):
             phase = now + (1 - now) * torch.linspace(0, 1, 50, dtype=now.dtype, device=now.device)
         members = self.forecast_members(state, phase)
         phase = phase.to(members).expand(members.shape[:-2])
-        return Forecast(members.mean(-2), members.var(-2), phase)
+        weights = None if state.weights is None else state.weights.unsqueeze(-2)
+        mean, variance = functional.ensemble_mean(members, weights), functional.ensemble_variance(members, weights)
+        return Forecast(mean, variance, phase)

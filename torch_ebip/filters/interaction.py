@@ -36,8 +36,8 @@ class BasisProjection(nn.Module):
         return self.basis.project(members[..., 0], members[..., 2:])
 
     def phase(self, members: Tensor) -> Tensor:
-        """Mean phase [...] of members [..., E, n]."""
-        return members[..., 0].mean(-1)
+        """Phase [..., E] of each of the members [..., E, n]."""
+        return members[..., 0]
 
     def at(self, members: Tensor, phase: Tensor) -> Tensor:
         """Projections [..., P, E, D] of members [..., E, n] at phases [..., P] that all of them share."""

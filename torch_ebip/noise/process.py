@@ -100,13 +100,11 @@ class InteractionNoise(nn.Module):
         factor = self.phase.cholesky(dt)
         steps = _normal_like(members[..., :2], generator) @ factor.transpose(-1, -2)
         if self.weights is None:
-            steps = torch.nn.functional.pad(steps, (0, members.shape[-1] - 2))
-        else:
-            scale = self.weights.scale(dt)
-            scale = scale if self.columns is None else scale[..., self.columns]
-            draws = _normal_like(members[..., 2:], generator)
-            steps = torch.cat([steps, draws * scale.unsqueeze(-2)], dim=-1)
-        return members + steps
+            return torch.cat([members[..., :2] + steps, members[..., 2:]], dim=-1)
+        scale = self.weights.scale(dt)
+        scale = scale if self.columns is None else scale[..., self.columns]
+        draws = _normal_like(members[..., 2:], generator)
+        return members + torch.cat([steps, draws * scale.unsqueeze(-2)], dim=-1)
 
 
 def _normal_like(members: Tensor, generator: torch.Generator | None) -> Tensor:
