@@ -1,5 +1,4 @@
-"""Robot kinematics. The one place that knows pytorch-kinematics, and it imports it only when an arm is
-built."""
+"""Robot kinematics. The one place that knows pytorch-kinematics, imported when an arm is built."""
 
 from torch_ebip.kinematics.arm import RobotArm
 

@@ -46,8 +46,7 @@ class RobotArm(nn.Module):
 
     @classmethod
     def ur5(cls, tool: Tensor | None = None) -> RobotArm:
-        """Universal Robots UR5 (CB3 series), base frame and flange as in the manufacturer's
-        Denavit-Hartenberg table.
+        """Universal Robots UR5 (CB3 series), in the manufacturer's Denavit-Hartenberg base frame.
 
         Args:
             tool: homogeneous transform flange -> tool, shape [4, 4], metres; identity if left out.
@@ -71,11 +70,10 @@ class RobotArm(nn.Module):
         return torch.tensor(speed, dtype=self.tool.dtype, device=self.tool.device)
 
     def forward(self, joints: Tensor) -> Tensor:
-        """Pose of the tool in the arm's base frame.
+        """Pose of the tool in the arm's base frame, in the wider of the joints' and the module's dtype.
 
         Args:
-            joints: angles [..., n_joints], rad, on the module's device. Computed in the wider of the two
-                dtypes.
+            joints: angles [..., n_joints], rad, on the module's device.
 
         Returns:
             homogeneous transforms [..., 4, 4], metres.
@@ -133,8 +131,7 @@ def _read(urdf: str | PathLike[str]) -> str:
 
 def _build_chain(text: str, end_link: str) -> Any:
     """pytorch-kinematics' `SerialChain` in float64 from the root link to `end_link`."""
-    # Imported here: it pulls in matplotlib, scipy and a URDF parser, which nobody without an arm should wait
-    # for.
+    # Imported here: it pulls in matplotlib and a URDF parser, which nobody without an arm should wait for.
     from pytorch_kinematics import Transform3d
     from pytorch_kinematics.chain import Chain, SerialChain
     from pytorch_kinematics.frame import Frame, Joint, Link
