@@ -70,7 +70,7 @@ class ForecastObjective(nn.Module):
         self.innovation = InnovationLikelihoodLoss()
         self.arm = arm
         self.arm_dofs = None if arm_dofs is None else arm_dofs[targets]
-        phases = scale.new_tensor([1 / 3, 2 / 3, 1.0]) if phases is None else phases.to(scale)
+        phases = scale.new_tensor([0.5, 1.0]) if phases is None else phases.to(scale)
         self.register_buffer("phases", phases)
 
     def forward(

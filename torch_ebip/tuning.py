@@ -237,32 +237,45 @@ class Tuner:
         return float(loss)
 
     @torch.no_grad()
-    def _validate(self, step: int) -> float:
-        """Mean loss of the validation interactions over all subsets, always at the same horizons and draws."""
+    def evaluate(self, interactions: Tensor | None = None) -> dict[str, float]:
+        """Scores of the filter as it is, always at the same horizons and draws; nothing is reported or changed.
+
+        Args:
+            interactions: int64 [B], which demonstrations; default: those kept for validation. Each is filtered
+                by an ensemble that does not contain it.
+
+        Returns:
+            ``loss``, its terms, ``subset/NAME`` the loss of each subset, and ``spread`` and ``error`` of the
+            forecasts of the end in units of the targets' spread over the demonstrations.
+        """
+        interactions = self.validating if interactions is None else interactions
         low, high = self.settings.horizons
         shares = low + (high - low) * (torch.arange(4) + 0.5) / 4
         totals: dict[str, list[float]] = {}
         spreads = []
         for name, subset in self.subsets.items():
             generator = torch.Generator().manual_seed(_mix(self.settings.seed, -1))
-            part, trace, context = self._filter(
-                self.validating, subset, shares.expand(len(self.validating), -1), generator
-            )
+            part, trace, context = self._filter(interactions, subset, shares.expand(len(interactions), -1), generator)
             terms = self.objective(part, trace, *context)
             for key, value in terms.items():
                 totals.setdefault(key, []).append(float(value))
             totals.setdefault(f"subset/{name}", []).append(sum(float(value) for value in terms.values()))
             spreads.append(self.objective.spread_and_error(part, trace, context[1], context[3]))
         means = {key: sum(values) / len(values) for key, values in totals.items()}
-        loss = sum(value for key, value in means.items() if not key.startswith("subset/"))
+        means["loss"] = sum(value for key, value in means.items() if not key.startswith("subset/"))
+        means["spread"], means["error"] = torch.stack(spreads).square().mean(0).sqrt().tolist()
+        return means
+
+    def _validate(self, step: int) -> float:
+        scores = self.evaluate()
         if self.monitor is not None:
-            spread, error = torch.stack(spreads).square().mean(0).sqrt().tolist()
-            scalars = {f"validation/{key}": value for key, value in means.items()}
-            scalars |= {"validation/loss": loss, "calibration/spread": spread, "calibration/error": error}
+            spread, error = scores.pop("spread"), scores.pop("error")
+            scalars = {f"validation/{key}": value for key, value in scores.items()}
+            scalars |= {"calibration/spread": spread, "calibration/error": error}
             scalars["calibration/spread_over_error"] = spread / error
             self.monitor.scalars(scalars, step)
             self.monitor.filter(self.filter, self.layout, step)
-        return loss
+        return scores["loss"]
 
     def _distance(self) -> Tensor:
         """Mean squared distance from the start within each parameter, summed over parameters."""

@@ -1,0 +1,199 @@
+"""From methods to values: what every method says of every test interaction, cell by cell."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from experiments.results import Cell, Values
+from torch_ebip import Demonstrations, EnsembleFilter, Forecast, InteractionPrimitive
+from torch_ebip import metrics as measure
+from torch_ebip.filters.ebip import restrict
+from torch_ebip.kinematics import RobotArm
+
+
+class Task(NamedTuple):
+    """What is asked of the methods.
+
+    Attributes:
+        subsets: sensors that are shown together, modality names by subset.
+        fractions: of the interaction that is shown.
+        skipped: (subset, fraction) cells in which nothing can have been measured.
+        targets: modalities to forecast, reported one by one.
+        leading: how many of a target's first DoFs count for its squared error; default: all.
+        arm: for the tool error, with the modality that holds its joints.
+    """
+
+    subsets: Mapping[str, Sequence[str]]
+    fractions: Sequence[float]
+    skipped: Sequence[tuple[str, float]]
+    targets: Sequence[str]
+    leading: Mapping[str, int]
+    arm: tuple[RobotArm, str] | None
+
+
+class Answer(NamedTuple):
+    """What a method says of the end of B interactions at K fractions.
+
+    Attributes:
+        forecast: mean and variance [B, K, D], at phase 1.
+        members: [B, K, E, D].
+        weights: of the members, [B, K, E]; None if equal.
+        phase: [B, K], where it believes the interaction is; NaN if it has no opinion.
+    """
+
+    forecast: Forecast
+    members: Tensor
+    weights: Tensor | None
+    phase: Tensor
+
+
+class Method(Protocol):
+    """Anything that answers."""
+
+    def __call__(self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor) -> Answer:
+        """Look at y [B, T, D] where observed, up to samples keep [B, K]; forecast the DoFs bool [D]."""
+
+
+class FilterMethod:
+    """A filter, with draws of its own seed."""
+
+    def __init__(self, filter: EnsembleFilter, seed: int) -> None:
+        self.filter, self.seed = filter, seed
+
+    @torch.no_grad()
+    def __call__(self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor) -> Answer:
+        """See `Method`. DoFs that are neither shown nor asked for are left out of the filter."""
+        used = observed.any(0).any(0) | dofs
+        part = restrict(self.filter, used)
+        generator = torch.Generator().manual_seed(self.seed)
+        trace = part(y[..., used], observed[..., used], generator=generator, keep=keep, project=False)
+        assert trace.kept is not None
+        members = part.forecast_members(trace.kept, y.new_ones(1))[..., 0, :, :][..., dofs[used]]
+        forecast = part.forecast(trace.kept, y.new_ones(1))
+        ends = (forecast.mean[..., 0, :][..., dofs[used]], forecast.variance[..., 0, :][..., dofs[used]])
+        return Answer(Forecast(*ends, forecast.phase), members, trace.kept.weights, part.phase(trace.kept))
+
+
+class MeanMethod:
+    """The mean of the training set, whatever is seen."""
+
+    def __init__(self, primitive: InteractionPrimitive) -> None:
+        self.ends = _ends(primitive)
+
+    def __call__(self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor) -> Answer:
+        """See `Method`."""
+        members = self.ends[:, dofs].expand(*keep.shape, -1, -1)
+        forecast = Forecast(members.mean(-2), members.var(-2), y.new_ones(keep.shape))
+        return Answer(forecast, members, None, y.new_full(keep.shape, torch.nan))
+
+
+class NearestMethod:
+    """The training demonstration that is nearest so far, each running at its own speed.
+
+    Distance: mean squared difference over what was measured, DoFs in units of their deviation.
+    """
+
+    def __init__(self, primitive: InteractionPrimitive) -> None:
+        self.primitive, self.ends = primitive, _ends(primitive)
+
+    def __call__(self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor) -> Answer:
+        """See `Method`."""
+        primitive = self.primitive
+        used = observed.any(0).any(0)
+        basis = primitive.basis.select(used)
+        weights = primitive.weights[:, used[primitive.basis.dof_of_weight()]]
+        phase = torch.arange(y.shape[1])[:, None] / primitive.rate * primitive.phase_velocity
+        paths = basis.project(phase, weights) / primitive.value_variance[used].sqrt()
+        chosen = torch.empty_like(keep)
+        for i in range(len(y)):
+            seen = observed[i][:, used]
+            values = torch.where(seen, y[i][:, used], 0) / primitive.value_variance[used].sqrt()
+            squares = (torch.where(seen.unsqueeze(1), paths - values.unsqueeze(1), 0)).square().sum(-1)
+            chosen[i] = squares.cumsum(0)[keep[i]].argmin(-1)
+        members = self.ends[:, dofs][chosen].unsqueeze(-2)
+        mean = members.squeeze(-2)
+        at = (keep / primitive.rate * primitive.phase_velocity[chosen]).to(y)
+        return Answer(Forecast(mean, torch.full_like(mean, torch.nan), at), members, None, at)
+
+
+def evaluate(task: Task, methods: Mapping[str, Method], tests: Demonstrations) -> Values:
+    """Values of every metric for every cell, method and test interaction."""
+    y, measured = tests.pad()
+    lengths = tests.lengths
+    layout = tests.layout
+    targets = layout.mask(task.targets)
+    truth = torch.stack([_last_measured(trajectory) for trajectory in tests])
+    steps = torch.stack([(lengths * fraction).round().long() - 1 for fraction in task.fractions], -1).clamp(min=0)
+    length = int(steps.max()) + 1
+    within = torch.arange(length).view(1, -1, 1) <= steps.amax(-1).view(-1, 1, 1)
+    true_phase = steps / (lengths - 1).unsqueeze(-1)
+    values: Values = {}
+    for subset, names in task.subsets.items():
+        observed = measured[:, :length] & layout.mask(names) & within
+        for name, method in methods.items():
+            answer = method(y[:, :length], observed, steps, targets)
+            for k, fraction in enumerate(task.fractions):
+                if (subset, fraction) not in task.skipped:
+                    for cell, array in _metrics(task, tests, subset, fraction, answer, k, truth, true_phase[:, k]):
+                        values.setdefault(cell, {})[name] = array.numpy().astype(np.float64)
+    return values
+
+
+def _metrics(
+    task: Task,
+    tests: Demonstrations,
+    subset: str,
+    fraction: float,
+    answer: Answer,
+    k: int,
+    truth: Tensor,
+    phase: Tensor,
+) -> list[tuple[Cell, Tensor]]:
+    layout = tests.layout
+    targets = layout.mask(task.targets)
+    order = targets.nonzero().squeeze(-1).tolist()
+    found: list[tuple[Cell, Tensor]] = []
+    for modality in task.targets:
+        part = layout.slice(modality)
+        columns = [order.index(dof) for dof in range(part.start, part.stop)]
+        target = truth[:, part]
+        forecast = Forecast(*(field[:, k][..., columns] for field in answer.forecast[:2]), answer.forecast.phase)
+        members = answer.members[:, k][..., columns]
+        unit = layout[modality].unit
+        lead = task.leading.get(modality, len(columns))
+        first = Forecast(forecast.mean[:, :lead], forecast.variance[:, :lead], forecast.phase)
+        found.append((Cell(subset, fraction, "mse", modality, f"{unit}^2"), measure.mse(first, target[:, :lead])))
+        found.append((Cell(subset, fraction, "mae", modality, unit), measure.mae(forecast, target)))
+        if members.shape[-2] > 1:
+            weights = None if answer.weights is None else answer.weights[:, k]
+            inside = measure.coverage_95(forecast, target)
+            found.append((Cell(subset, fraction, "coverage_95", modality, "1"), inside))
+            found.append((Cell(subset, fraction, "crps", modality, unit), measure.crps(members, target, weights)))
+    if task.arm is not None:
+        arm, modality = task.arm
+        part = layout.slice(modality)
+        columns = [order.index(dof) for dof in range(part.start, part.stop)]
+        distance = measure.tool_error(arm, answer.forecast.mean[:, k][..., columns], truth[:, part])
+        found.append((Cell(subset, fraction, "tool_error", None, "m"), distance))
+    if not answer.phase.isnan().any():
+        found.append(
+            (Cell(subset, fraction, "phase_error", None, "1"), measure.phase_error(answer.phase[:, k], phase))
+        )
+    return found
+
+
+def _ends(primitive: InteractionPrimitive) -> Tensor:
+    return primitive.basis.project(torch.ones(len(primitive)), primitive.weights)
+
+
+def _last_measured(trajectory: Tensor) -> Tensor:
+    """[D]: the last measured value of each DoF, NaN for one that was not measured in the last twentieth."""
+    recent = trajectory[-max(1, len(trajectory) // 20) :]
+    steps = torch.arange(len(recent)).unsqueeze(-1)
+    last = torch.where(recent.isnan(), -1, steps).amax(0)
+    return torch.where(last >= 0, recent.gather(0, last.clamp(min=0).unsqueeze(0))[0], torch.nan)

@@ -1,0 +1,114 @@
+"""Pictures of results, forecasts and learned noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import torch
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from torch_ebip import Demonstrations, EnsembleFilter
+from torch_ebip.filters.ebip import restrict
+from torch_ebip.layout import Layout
+from torch_ebip.metrics import Z95
+from torch_ebip.noise import MeasurementNoise
+
+COLOURS = {"mean": "0.6", "nearest": "0.4", "ebip": "tab:red", "ebip_scaled": "tab:orange", "ebip_tuned": "tab:blue"}
+
+
+def results_figure(results: Mapping[str, Any], panels: Sequence[tuple[str, str | None]]) -> Figure:
+    """Mean and standard error of every method in every cell, a panel for each (metric, modality)."""
+    figure, axes = plt.subplots(len(panels), 1, figsize=(9, 2.6 * len(panels)), squeeze=False, layout="constrained")
+    for axis, (metric, modality) in zip(axes[:, 0], panels, strict=True):
+        rows = [row for row in results["rows"] if (row["metric"], row["modality"]) == (metric, modality)]
+        cells = list(dict.fromkeys((row["subset"], row["observed"]) for row in rows))
+        methods = list(dict.fromkeys(row["method"] for row in rows))
+        for i, method in enumerate(methods):
+            mine = [row for row in rows if row["method"] == method]
+            at = [cells.index((row["subset"], row["observed"])) + 0.14 * (i - (len(methods) - 1) / 2) for row in mine]
+            errors = [row["standard_error"] or 0.0 for row in mine]
+            means = [row["mean"] for row in mine]
+            axis.errorbar(at, means, errors, fmt="o", ms=4, capsize=2, color=COLOURS.get(method), label=method)
+        axis.set_xticks(range(len(cells)), [f"{subset}\n{observed:.0%}" for subset, observed in cells], fontsize=8)
+        unit = "" if rows[0]["unit"] == "1" else f" [{rows[0]['unit']}]"
+        axis.set_ylabel(f"{metric}{'' if modality is None else ' ' + modality}{unit}", fontsize=9)
+        axis.grid(axis="y", alpha=0.3)
+        if metric == "coverage_95":
+            axis.axhline(0.95, color="0.3", lw=0.8, ls="--")
+        else:
+            axis.set_ylim(bottom=0)
+    axes[0, 0].legend(ncols=5, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, 1.25), frameon=False)
+    axes[-1, 0].set_xlabel("observed modalities and share of the interaction")
+    return figure
+
+
+def forecast_figure(
+    filters: Mapping[str, EnsembleFilter],
+    tests: Demonstrations,
+    index: int,
+    subset: Tensor,
+    dofs: Sequence[str],
+    fractions: Sequence[float],
+) -> Figure:
+    """Forecasts of some DoFs of one test interaction with 95 % intervals: a row a DoF, a column a fraction."""
+    layout, trajectory = tests.layout, tests[index]
+    last = len(trajectory) - 1
+    figure, axes = plt.subplots(
+        len(dofs), len(fractions), figsize=(4.5 * len(fractions), 2.4 * len(dofs)), squeeze=False,
+        sharex=True, sharey="row", layout="constrained",
+    )  # fmt: skip
+    used = subset | layout.mask(dofs)
+    names = [dof for dof, kept in zip(layout.dofs, used.tolist(), strict=True) if kept]
+    for column, fraction in enumerate(fractions):
+        now = round(fraction * (last + 1)) - 1
+        y = trajectory[: now + 1, used]
+        observed = subset[used] & ~y.isnan()
+        for label, whole in filters.items():
+            part = restrict(whole, used)
+            with torch.no_grad():
+                trace = part(y, observed, generator=torch.Generator().manual_seed(0), project=False)
+                phase = torch.linspace(now / last, 1, 60)
+                forecast = part.forecast(trace.state, phase)
+            for row, dof in enumerate(dofs):
+                mean = forecast.mean[:, names.index(dof)]
+                half = Z95 * forecast.variance[:, names.index(dof)].sqrt()
+                axis, colour = axes[row, column], COLOURS.get(label)
+                axis.plot(phase, mean, color=colour, lw=1.5, label=label)
+                axis.fill_between(phase, mean - half, mean + half, color=colour, alpha=0.18, lw=0)
+        for row, dof in enumerate(dofs):
+            axis = axes[row, column]
+            truth = trajectory[:, layout.dofs.index(dof)]
+            axis.plot(torch.linspace(0, 1, last + 1), truth, color="black", lw=1, ls="--", label="truth")
+            axis.axvline(now / last, color="0.5", lw=0.8)
+            axis.set_ylabel(f"{dof} [{layout.units[layout.dofs.index(dof)]}]" if column == 0 else "", fontsize=9)
+            axis.grid(alpha=0.3)
+        axes[0, column].set_title(f"{fraction:.0%} observed", fontsize=10)
+        axes[-1, column].set_xlabel("phase")
+    axes[0, 0].legend(fontsize=8)
+    return figure
+
+
+def noise_figure(filter: EnsembleFilter, closed_form: Tensor, layout: Layout, shown: Sequence[str]) -> Figure:
+    """The learned R relative to the closed form over phase, a line a modality (geometric mean over its DoFs)."""
+    noise = filter.noise.measurement
+    if not isinstance(noise, MeasurementNoise):
+        raise TypeError("the filter's measurement noise is not one that is learned")
+    figure, axis = plt.subplots(figsize=(6, 3.5), layout="constrained")
+    phases = torch.linspace(0, 1, 100)
+    with torch.no_grad():
+        variance = noise(phases).square().expand(100, -1)
+    for name in shown:
+        part = layout.slice(name)
+        ratio = (variance[:, part] / closed_form[part]).log().mean(-1).exp()
+        axis.semilogy(phases, ratio, label=name)
+    axis.set_xlabel("phase")
+    axis.set_ylabel("R / closed-form R")
+    axis.grid(alpha=0.3, which="both")
+    axis.legend(fontsize=8, ncols=2)
+    return figure

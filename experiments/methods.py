@@ -1,0 +1,136 @@
+"""The filters that `experiments.tune` compares: closed form, best single factor, tuned."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from experiments.run_folder import write_json
+from torch_ebip import BSplineBasis, Demonstrations, EnsembleFilter, InteractionPrimitive, ebip
+from torch_ebip.kinematics import RobotArm
+from torch_ebip.losses import ForwardKinematicsLoss
+from torch_ebip.monitor import Monitor
+from torch_ebip.noise import AboveOne
+from torch_ebip.objective import ForecastObjective, Weights
+from torch_ebip.tuning import Tuner, TuningResult, TuningSettings
+
+FACTORS = (1.0, 10.0, 100.0, 1000.0, 10000.0)
+"""Coarse grid of factors on the closed-form R; the best one is refined by half-decades."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is tuned for.
+
+    Attributes:
+        demonstrations: of the training part only.
+        primitive: of these demonstrations.
+        targets: bool [D], DoFs to forecast.
+        subsets: bool [D] of sensors by name.
+        arm: with bool [D] of its joints, for the forward-kinematics term; None without one.
+    """
+
+    demonstrations: Demonstrations
+    primitive: InteractionPrimitive
+    targets: Tensor
+    subsets: Mapping[str, Tensor]
+    arm: tuple[RobotArm, Tensor] | None
+
+    def objective(self) -> ForecastObjective:
+        """CRPS and squared error of the targets, plus the tool's distance where there is an arm."""
+        if self.arm is None:
+            return ForecastObjective(self.primitive, self.targets)
+        arm, joints = self.arm
+        weights = Weights(tool=1.0)
+        loss = ForwardKinematicsLoss(arm, rotation_weight=0.1)
+        return ForecastObjective(self.primitive, self.targets, weights=weights, arm=loss, arm_dofs=joints)
+
+
+def scaled(primitive: InteractionPrimitive, factor: float) -> EnsembleFilter:
+    """The paper's eBIP with its R times one factor."""
+    return ebip(primitive, residual_variance=factor * primitive.residual_variance)
+
+
+def tunable(primitive: InteractionPrimitive, factor: float) -> EnsembleFilter:
+    """What is tuned: square-root eBIP whose R depends on phase, with inflation and evidence weights."""
+    return ebip(
+        primitive,
+        residual_variance=factor * primitive.residual_variance,
+        context=BSplineBasis(4),
+        inflation=AboveOne(primitive.weights.new_tensor(1.002)),
+        square_root=True,
+        weigh=True,
+    )
+
+
+def best_factor(
+    problem: Problem,
+    build: Callable[[InteractionPrimitive, float], EnsembleFilter],
+    settings: TuningSettings,
+    interactions: int,
+    record: Path,
+) -> float:
+    """The factor on R with the smallest loss on training interactions: what a sceptic does instead of gradients.
+
+    Args:
+        problem: the training part.
+        build: a filter from a primitive and a factor.
+        settings: of the ensembles and horizons, the same as for tuning.
+        interactions: how many training interactions decide.
+        record: file of the losses, read again if it exists.
+    """
+    losses: dict[float, float] = {}
+    if record.exists():
+        losses = {float(factor): loss for factor, loss in json.loads(record.read_text()).items()}
+    order = torch.randperm(len(problem.primitive), generator=torch.Generator().manual_seed(settings.seed + 1))
+
+    def measure(factors: Sequence[float]) -> None:
+        for factor in factors:
+            if factor not in losses:
+                tuner = _tuner(problem, build(problem.primitive, factor), replace(settings, thinning=2))
+                losses[factor] = tuner.evaluate(order[:interactions])["loss"]
+
+    measure(FACTORS)
+    best = min(losses, key=lambda factor: losses[factor])
+    measure((best / 10**0.5, best * 10**0.5))
+    write_json(record, losses)
+    return min(losses, key=lambda factor: losses[factor])
+
+
+def tune(
+    problem: Problem,
+    filter: EnsembleFilter,
+    settings: TuningSettings,
+    monitor: Monitor | None,
+    checkpoint: Path | None,
+    progress: Callable[[int, float, float], None] | None,
+) -> TuningResult:
+    """Tune a filter in place."""
+    return _tuner(problem, filter, settings, monitor, checkpoint, progress).run()
+
+
+def _tuner(
+    problem: Problem,
+    filter: EnsembleFilter,
+    settings: TuningSettings,
+    monitor: Monitor | None = None,
+    checkpoint: Path | None = None,
+    progress: Callable[[int, float, float], None] | None = None,
+) -> Tuner:
+    return Tuner(
+        filter,
+        problem.demonstrations,
+        problem.primitive,
+        problem.objective(),
+        problem.targets,
+        problem.subsets,
+        settings,
+        monitor,
+        checkpoint,
+        progress,
+    )

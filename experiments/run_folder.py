@@ -1,0 +1,90 @@
+"""A run folder: what was run, with which settings and versions, and whether it is finished."""
+
+from __future__ import annotations
+
+import json
+import platform
+import shutil
+import subprocess
+import time
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from torch_ebip.files import atomic_write
+
+
+class RunFolder:
+    """The folder of one run of an experiment, new or to be resumed.
+
+    Args:
+        experiment: its name.
+        settings: everything that decides the result; an unfinished run is resumed only with the same.
+        out: the folder; default ``runs/EXPERIMENT/STAMP``.
+        force: start over, whatever is there.
+
+    Raises:
+        SystemExit: the folder cannot be written, holds a finished run, another experiment, other settings, or
+            files that are not a run's; says which.
+    """
+
+    def __init__(
+        self, experiment: str, settings: Mapping[str, Any], out: str | None = None, force: bool = False
+    ) -> None:
+        stamp = time.strftime("%Y%m%d-%H%M%S")
+        self.path = Path(out) if out is not None else Path("runs") / experiment / stamp
+        config = self.path / "config.json"
+        asked = json.loads(json.dumps(dict(settings)))
+        if self.path.exists() and not self.path.is_dir():
+            raise SystemExit(f"{self.path} is a file, expected a folder to write the run to")
+        if self.path.is_dir() and any(self.path.iterdir()) and not config.exists():
+            raise SystemExit(f"{self.path} holds files but no run; choose another --out")
+        if config.exists() and force:
+            shutil.rmtree(self.path)
+        if config.exists():
+            self._check(json.loads(config.read_text()), experiment, asked)
+            print(f"resuming {self.path}")
+            return
+        try:
+            write_json(config, {"experiment": experiment, "settings": asked, **_environment()})
+        except OSError as error:
+            raise SystemExit(f"{self.path} cannot be written: {error}") from error
+
+    def _check(self, stored: Mapping[str, Any], experiment: str, asked: Mapping[str, Any]) -> None:
+        if stored["experiment"] != experiment:
+            raise SystemExit(f"{self.path} holds a run of {stored['experiment']}, not of {experiment}")
+        theirs = stored["settings"]
+        names = sorted({*theirs, *asked})
+        differing = [
+            f"{n}: {theirs.get(n)} there, {asked.get(n)} here" for n in names if theirs.get(n) != asked.get(n)
+        ]
+        if differing:
+            raise SystemExit(
+                f"{self.path} holds a run with other settings ({'; '.join(differing)}); --force starts over"
+            )
+        if self.results.exists():
+            raise SystemExit(f"{self.path} holds a finished run; --force starts over")
+
+    @property
+    def results(self) -> Path:
+        """``results.json``, there once the run is finished."""
+        return self.path / "results.json"
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON atomically; numbers that are not finite become null."""
+    with atomic_write(path) as file:
+        file.write((json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
+
+
+def _environment() -> dict[str, Any]:
+    packages = ("torch", "numpy", "pytorch-kinematics", "tensorboard", "scipy", "matplotlib")
+    commit = subprocess.run(
+        ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"], capture_output=True, text=True, check=False
+    )
+    return {
+        "versions": {"python": platform.python_version(), **{name: version(name) for name in packages}},
+        "commit": commit.stdout.strip() or None,
+        "machine": {"system": platform.platform(), "processor": platform.machine()},
+    }
