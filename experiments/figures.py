@@ -35,7 +35,7 @@ def results_figure(results: Mapping[str, Any], panels: Sequence[tuple[str, str |
             errors = [row["standard_error"] or 0.0 for row in mine]
             means = [row["mean"] for row in mine]
             axis.errorbar(at, means, errors, fmt="o", ms=4, capsize=2, color=COLOURS.get(method), label=method)
-        axis.set_xticks(range(len(cells)), [f"{subset}\n{observed:.0%}" for subset, observed in cells], fontsize=8)
+        axis.set_xticks(range(len(cells)), [_label(*cell) for cell in cells], fontsize=8)
         unit = "" if rows[0]["unit"] == "1" else f" [{rows[0]['unit']}]"
         axis.set_ylabel(f"{metric}{'' if modality is None else ' ' + modality}{unit}", fontsize=9)
         axis.grid(axis="y", alpha=0.3)
@@ -112,3 +112,7 @@ def noise_figure(filter: EnsembleFilter, closed_form: Tensor, layout: Layout, sh
     axis.grid(alpha=0.3, which="both")
     axis.legend(fontsize=8, ncols=2)
     return figure
+
+
+def _label(subset: str, observed: float) -> str:
+    return f"{subset.replace('+', '+' + chr(10), 2)}\n{observed:.0%}"
