@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -73,6 +73,7 @@ def best_factor(
     build: Callable[[InteractionPrimitive, float], EnsembleFilter],
     settings: TuningSettings,
     interactions: int,
+    factors: Sequence[float],
     record: Path,
 ) -> float:
     """The factor on R with the smallest loss on training interactions: what a sceptic does instead of gradients.
@@ -82,6 +83,7 @@ def best_factor(
         build: a filter from a primitive and a factor.
         settings: of the ensembles and horizons, the same as for tuning.
         interactions: how many training interactions decide.
+        factors: grid; half-decades around its best one are tried too.
         record: file of the losses, read again if it exists.
     """
     losses: dict[float, float] = {}
@@ -92,12 +94,12 @@ def best_factor(
     def measure(factors: Sequence[float]) -> None:
         for factor in factors:
             if factor not in losses:
-                tuner = _tuner(problem, build(problem.primitive, factor), replace(settings, thinning=2))
+                tuner = _tuner(problem, build(problem.primitive, factor), settings)
                 losses[factor] = tuner.evaluate(order[:interactions])["loss"]
 
-    measure(FACTORS)
+    measure(factors)
     best = min(losses, key=lambda factor: losses[factor])
-    measure((best / 10**0.5, best * 10**0.5))
+    measure((round(best / 10**0.5, 6), round(best * 10**0.5, 6)))
     write_json(record, losses)
     return min(losses, key=lambda factor: losses[factor])
 

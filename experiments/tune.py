@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from experiments.evaluate import FilterMethod, MeanMethod, NearestMethod, Task, evaluate
 from experiments.figures import forecast_figure, noise_figure, results_figure
-from experiments.methods import Problem, best_factor, scaled, tunable, tune
+from experiments.methods import FACTORS, Problem, best_factor, scaled, tunable, tune
 from experiments.results import Cell, Values, print_tables, summarise
 from experiments.run_folder import RunFolder, write_json
 from torch_ebip import Demonstrations, InteractionPrimitive, select_basis
@@ -100,8 +100,8 @@ def run_fold(job: Job, progress: Callable[[int, float, float], None] | None = No
         config = {**asdict(job), "tuning": None, **asdict(job.tuning)}
         monitor.text("configuration", "\n".join(f"- `{key}`: {value}" for key, value in config.items()))
         monitor.text("basis", f"```\n{selection_table(rank_candidates(known))}\n```")
-        factor = best_factor(problem, scaled, job.tuning, job.scan, folder / "scan_scaled.json")
-        start = best_factor(problem, tunable, job.tuning, job.scan, folder / "scan_tunable.json")
+        factor = best_factor(problem, scaled, job.tuning, job.scan, FACTORS, folder / "scan_scaled.json")
+        start = best_factor(problem, tunable, job.tuning, job.scan, [factor], folder / "scan_tunable.json")
         tuned = tunable(primitive, start)
         result = tune(problem, tuned, job.tuning, monitor, folder / "checkpoint.pt", progress)
         filters = {"ebip": scaled(primitive, 1.0), "ebip_scaled": scaled(primitive, factor), "ebip_tuned": tuned}
@@ -267,7 +267,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--folds", type=int, default=1, help="cross-validation; 1 holds out a fifth once (default: 1)"
     )
-    parser.add_argument("--steps", type=int, default=120, help="gradient steps at most (default: 120)")
+    parser.add_argument("--steps", type=int, default=100, help="gradient steps at most (default: 100)")
     parser.add_argument("--seed", type=int, default=0, help="of data, splits and draws (default: 0)")
     parser.add_argument("--quick", action="store_true", help="a run of about a minute, to see that all works")
     parser.add_argument("--workers", type=int, help="processes for folds (default: one a core)")

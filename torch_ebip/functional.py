@@ -214,7 +214,7 @@ def _innovation(
     variance = (anomalies.square() * shares).sum(-2) + noise.square().sum(-1)
     if observed is not None:
         variance = torch.where(observed, variance, 1)
-    scale = variance.sqrt()
+    scale = torch.where(variance > 0, variance, 1).sqrt()
     # In units of its own standard deviation S has ones on its diagonal: modalities whose units differ by
     # many orders of magnitude can be factored together in float32.
     anomalies = anomalies / scale.unsqueeze(-2)

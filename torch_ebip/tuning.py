@@ -52,7 +52,7 @@ class TuningSettings:
         seed: of everything random.
     """
 
-    steps: int = 120
+    steps: int = 100
     batch_size: int = 16
     learning_rate: float = 0.1
     horizons: tuple[float, float] = (0.2, 0.95)
@@ -62,7 +62,7 @@ class TuningSettings:
     pull: float = 0.01
     clip: float = 1.0
     validation: float = 0.2
-    validate_every: int = 10
+    validate_every: int = 20
     patience: int = 5
     thinning: int = 4
     segment: int = 0
@@ -227,14 +227,15 @@ class Tuner:
         optimizer.step()
         if self.monitor is not None:
             samples = int(context[0].any(-1).sum())
-            scalars = {f"train/{key}": float(value) for key, value in terms.items()}
-            scalars |= {"train/loss": float(loss), f"train_subset/{name}": float(loss), "gradient/norm": norm}
+            scalars = {f"train/{key}": float(value.detach()) for key, value in terms.items()}
+            total = float(loss.detach())
+            scalars |= {"train/loss": total, f"train_subset/{name}": total, "gradient/norm": norm}
             scalars["throughput/samples_per_second"] = samples / (time.monotonic() - began)
             for key, parameter in self.parameters.items():
                 if parameter.grad is not None:
                     scalars[f"gradient/{key}"] = float(parameter.grad.norm())
             self.monitor.scalars(scalars, step)
-        return float(loss)
+        return float(loss.detach())
 
     @torch.no_grad()
     def evaluate(self, interactions: Tensor | None = None) -> dict[str, float]:

@@ -156,8 +156,8 @@ class EnsembleFilter(Filter):
             names = "" if self.dof_names is None else f" ({', '.join(self.dof_names[i] for i in error.dofs)})"
             raise ValueError(f"{error}{names}") from error
         if self.inflation is not None:
-            grown = torch.where(observed.any(-1), self._inflation_factor(members) ** self.thinning, 1)
-            updated = functional.inflate(updated, grown, weights)
+            grown = functional.inflate(updated, self._inflation_factor(members) ** self.thinning, weights)
+            updated = torch.where(observed.any(-1)[..., None, None], grown, updated)
         return EnsembleState(updated, self._weigh(state.evidence, updated, y, observed)), likelihood
 
     def _weigh(self, evidence: Evidence | None, members: Tensor, y: Tensor, observed: Tensor) -> Evidence | None:

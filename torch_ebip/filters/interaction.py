@@ -12,11 +12,26 @@ from torch_ebip.basis.stacked import StackedBasis
 
 
 class ConstantVelocityPhase(nn.Module):
-    """g(x): the phase advances by its velocity times dt, all else stays (the paper's matrix G)."""
+    """g(x): the phase advances by its velocity times dt, all else stays (the paper's matrix G).
+
+    Outside [0, 1] the paper says nothing. An interaction that is over stays at its end: there the excess e
+    becomes e / (1 + |e| / overrun), which is e near the interval and never more than ``overrun``. So members
+    that ran past the end while sensors were blind wait close to it, keep their gradients and their response
+    to measurements, and can be called back.
+
+    Args:
+        overrun: how far beyond the interval a phase can get.
+    """
+
+    def __init__(self, overrun: float = 0.05) -> None:
+        super().__init__()
+        self.overrun = overrun
 
     def forward(self, members: Tensor, dt: Tensor) -> Tensor:
-        """Members [..., E, n] after dt [...] seconds; the phase is not clamped."""
+        """Members [..., E, n] after dt [...] seconds."""
         phase = members[..., :1] + members[..., 1:2] * dt[..., None, None]
+        excess = phase - phase.clamp(0, 1)
+        phase = phase - excess * excess.abs() / (self.overrun + excess.abs())
         return torch.cat([phase, members[..., 1:]], dim=-1)
 
 

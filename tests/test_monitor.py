@@ -1,0 +1,98 @@
+"""What TensorBoard shows, read back from the real server over HTTP."""
+
+import json
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.test_tuning import filter_and_tuner
+from torch_ebip.monitor import Monitor, noise_scalars
+
+
+def free_port() -> int:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return int(listener.getsockname()[1])
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[str]:
+    """A tuning run with everything a run reports, behind a TensorBoard server on the loopback address."""
+    plt = pytest.importorskip("matplotlib.pyplot")
+    with Monitor(tmp_path) as monitor:
+        filter_and_tuner(monitor=monitor)[1].run()
+        monitor.text("configuration", "- `seed`: 3")
+        figure, axis = plt.subplots()
+        axis.plot([0, 1])
+        monitor.figure("forecast", figure, 0)
+        monitor.hyperparameters({"seed": 3, "only": ("*",)}, {"final/mse": 0.5})
+    port = free_port()
+    command = [sys.executable, "-m", "tensorboard.main", "--logdir", str(tmp_path), "--port", str(port)]
+    server = subprocess.Popen([*command, "--host", "127.0.0.1", "--load_fast=false"], stderr=subprocess.PIPE)
+    try:
+        yield f"http://127.0.0.1:{port}/data"
+    finally:
+        server.terminate()
+        server.wait(20)
+        assert server.stderr is not None
+        server.stderr.close()
+
+
+def get(url: str, ready=bool) -> object:
+    """JSON behind a URL, once the server is up and has read the events."""
+    deadline = time.monotonic() + 90
+    while True:
+        try:
+            with urllib.request.urlopen(url, timeout=10) as answer:
+                content = json.load(answer)
+            if ready(content):
+                return content
+        except OSError:
+            pass
+        if time.monotonic() > deadline:
+            raise AssertionError(f"{url} did not answer in time")
+        time.sleep(0.5)
+
+
+def test_tags_read_back_over_http(served: str) -> None:
+    tags = get(f"{served}/plugin/scalars/tags", lambda c: any("calibration/spread" in run for run in c.values()))
+    names = {name for run in tags.values() for name in run}
+    expected = {
+        *("train/loss", "train/crps", "train/squared_error", "train/pull", "train_subset/hand", "train_subset/both"),
+        *("validation/loss", "validation/crps", "validation/squared_error", "validation/subset/both"),
+        *("R/hand", "R/gaze", "R_factor/hand.x", "R_phase/gaze/0.50", "Q/phase_acceleration", "inflation"),
+        *("gradient/norm", "gradient/noise.measurement.variance.raw", "throughput/samples_per_second"),
+        *("calibration/spread", "calibration/error", "calibration/spread_over_error", "weighting/sharpness"),
+        "final/mse",
+    }
+    assert expected <= names, expected - names
+    run = next(run for run, found in tags.items() if "validation/loss" in found)
+    points = get(f"{served}/plugin/scalars/scalars?tag=validation%2Floss&run={urllib.request.quote(run)}")
+    assert [step for _, step, _ in points] == [0, 4, 8, 12]
+    images = get(f"{served}/plugin/images/tags")
+    assert any("forecast" in found for found in images.values())
+    texts = get(f"{served}/plugin/text/tags")
+    assert any("configuration" in name for found in texts.values() for name in found)
+
+
+def test_constrained_values_are_logged_not_raw_ones() -> None:
+    made, tuner = filter_and_tuner()
+    values = noise_scalars(made, tuner.layout)
+    closed = tuner.primitive.residual_variance.sqrt()
+    assert values["R/gaze"] == pytest.approx(float(closed[2]), rel=1e-4)
+    assert values["R/hand"] == pytest.approx(float((closed[0] * closed[1]).sqrt()), rel=1e-4)
+    assert values["inflation"] == pytest.approx(1.01)
+    with torch.no_grad():
+        made.noise.measurement.gates[-1, 1] = 1.0
+        made.noise.measurement.variance.raw[2] = 2.0
+    values = noise_scalars(made, tuner.layout)
+    assert values["R_phase/gaze/1.00"] == pytest.approx(2.718, rel=1e-3)
+    assert values["R_phase/gaze/0.00"] == pytest.approx(1.0)
+    assert values["R/gaze"] == pytest.approx(float(closed[2]) * 2.718, rel=1e-3)

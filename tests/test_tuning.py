@@ -1,0 +1,225 @@
+"""Tuning: honest ensembles, gradients that help, runs that resume to the same numbers."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.conftest import interactions, small_primitive
+from torch_ebip import BSplineBasis, EnsembleFilter, ebip
+from torch_ebip.checkpoint import load_checkpoint, save_checkpoint
+from torch_ebip.filters.ebip import restrict
+from torch_ebip.kinematics import RobotArm
+from torch_ebip.losses import ForwardKinematicsLoss
+from torch_ebip.noise import AboveOne
+from torch_ebip.objective import ForecastObjective, Weights
+from torch_ebip.tuning import Tuner, TuningSettings
+
+TARGETS = torch.tensor([False, False, False, True, True])
+SUBSETS = {"hand": torch.tensor([True, True, False, False, False]), "both": ~TARGETS}
+SMALL = TuningSettings(steps=12, batch_size=6, validate_every=4, folds=4, thinning=2, seed=3)
+
+
+def filter_and_tuner(
+    settings: TuningSettings = SMALL, factor: float = 1.0, **options
+) -> tuple[EnsembleFilter, Tuner]:
+    primitive = small_primitive()
+    one, start = primitive.weights.new_tensor(1.01), factor * primitive.residual_variance
+    arguments = {"context": BSplineBasis(4), "inflation": AboveOne(one), "residual_variance": start}
+    made = ebip(primitive, **arguments, square_root=True, weigh=True)
+    objective = ForecastObjective(primitive, TARGETS)
+    return made, Tuner(made, interactions(), primitive, objective, TARGETS, SUBSETS, settings, **options)
+
+
+def parameters(made: EnsembleFilter) -> dict[str, torch.Tensor]:
+    return {name: p.detach().clone() for name, p in made.named_parameters()}
+
+
+def test_no_ensemble_contains_its_interaction(monkeypatch: pytest.MonkeyPatch) -> None:
+    made, tuner = filter_and_tuner()
+    seen = []
+    original = type(tuner)._members
+
+    def recording(self, picked, generator):
+        members = original(self, picked, generator)
+        seen.append((picked, members))
+        return members
+
+    monkeypatch.setattr(type(tuner), "_members", recording)
+    tuner.run()
+    assert len(seen) > 12
+    for picked, members in seen:
+        assert not (members == picked[:, None]).any()
+        assert all(len(set(row.tolist())) == len(row) for row in members)
+    trained = torch.cat([picked for picked, _ in seen if len(picked) == 6])
+    assert not set(trained.tolist()) & set(tuner.validating.tolist())
+
+
+@pytest.mark.parametrize("size", [5, 40])
+def test_smaller_and_larger_ensembles(size: int) -> None:
+    _, tuner = filter_and_tuner(TuningSettings(n_members=size, folds=4))
+    members = tuner._members(torch.arange(6), torch.Generator().manual_seed(0))
+    assert members.shape == (6, size)
+    assert not (members == torch.arange(6)[:, None]).any()
+
+
+def test_tuning_improves_the_validation_loss_and_moves_the_noise() -> None:
+    """From a noise that is a thousand times too large, which shuts the measurements out."""
+    settings = TuningSettings(steps=40, batch_size=8, validate_every=10, folds=4, thinning=2, learning_rate=0.3, pull=0)
+    made, tuner = filter_and_tuner(settings, factor=1000.0)
+    start = tuner.evaluate()["loss"]
+    result = tuner.run()
+    assert min(result.validation.values()) < 0.5 * start
+    assert result.validation[0] == pytest.approx(start)
+    assert tuner.evaluate()["loss"] == pytest.approx(result.validation[result.best_step])
+    moved = parameters(made)
+    assert moved["noise.measurement.variance.raw"][:3].max() < 0
+    assert not moved["noise.measurement.variance.raw"][3:].any()  # never observed
+
+
+def test_the_gradient_of_a_step_is_that_of_finite_differences() -> None:
+    """Through ensembles, thinning, masks, forecast and scores: the derivative along a random direction."""
+    primitive = small_primitive(torch.float64)
+    made = ebip(primitive, context=BSplineBasis(4), square_root=True, weigh=True, localise=True)
+    objective = ForecastObjective(primitive, TARGETS, weights=Weights(1.0, 1.0, 0.0, 0.1))
+    demonstrations = interactions(dtype=torch.float64)
+    tuner = Tuner(made, demonstrations, primitive, objective, TARGETS, SUBSETS, SMALL)
+    shares = torch.tensor([[0.3, 0.7]]).expand(4, 2)
+
+    def loss() -> torch.Tensor:
+        generator = torch.Generator().manual_seed(0)
+        part, trace, context = tuner._filter(torch.arange(4), SUBSETS["both"], shares, generator)
+        return torch.stack(list(objective(part, trace, *context).values())).sum()
+
+    loss().backward()
+    generator = torch.Generator().manual_seed(1)
+    direction = {n: torch.randn(p.shape, generator=generator, dtype=p.dtype) for n, p in made.named_parameters()}
+    slope = sum((p.grad * direction[n]).sum() for n, p in made.named_parameters() if p.grad is not None)
+    values = []
+    for sign in (1, -1):
+        with torch.no_grad():
+            for name, p in made.named_parameters():
+                p.add_(sign * 1e-5 * direction[name])
+            values.append(loss().item())
+            for name, p in made.named_parameters():
+                p.sub_(sign * 1e-5 * direction[name])
+    assert slope.item() == pytest.approx((values[0] - values[1]) / 2e-5, rel=1e-5)
+
+
+def test_an_interrupted_run_ends_in_the_same_numbers(tmp_path: Path) -> None:
+    made, tuner = filter_and_tuner()
+    uninterrupted = tuner.run()
+    expected = parameters(made)
+
+    class Interrupted(Exception):
+        pass
+
+    def stop(step: int, *_: float) -> None:
+        if step == 9:  # one step after the checkpoint at 8
+            raise Interrupted
+
+    _, first = filter_and_tuner(checkpoint=tmp_path / "c.pt", progress=stop)
+    with pytest.raises(Interrupted):
+        first.run()
+    resumed, second = filter_and_tuner(checkpoint=tmp_path / "c.pt")
+    result = second.run()
+    assert result.validation == uninterrupted.validation
+    for name, value in parameters(resumed).items():
+        assert torch.equal(value, expected[name]), name
+    again, third = filter_and_tuner(checkpoint=tmp_path / "c.pt")
+    assert third.run().validation == uninterrupted.validation
+    assert torch.equal(parameters(again)["inflation.raw"], expected["inflation.raw"])
+
+
+def test_only_the_named_parameters_are_tuned() -> None:
+    made, tuner = filter_and_tuner(TuningSettings(steps=4, folds=4, validate_every=2, only=("weighting.*", "inflation*")))
+    tuner.run()
+    moved = {name for name, value in parameters(made).items() if value.abs().max() > 0}
+    assert moved
+    assert all(name.startswith(("weighting", "inflation")) for name in moved)
+
+
+def test_stops_early_when_validation_no_longer_improves() -> None:
+    settings = TuningSettings(steps=400, learning_rate=3.0, batch_size=4, folds=4, validate_every=1, patience=3, clip=1e3)
+    _, tuner = filter_and_tuner(settings)
+    result = tuner.run()
+    assert result.stopped_early
+    assert max(result.validation) == result.best_step + 3
+
+
+def test_a_strong_pull_keeps_parameters_at_the_start() -> None:
+    near, _ = pair = filter_and_tuner(TuningSettings(steps=10, folds=4, pull=100.0))
+    pair[1].run()
+    far, tuner = filter_and_tuner(TuningSettings(steps=10, folds=4, pull=0.0))
+    tuner.run()
+    size = [sum(float(p.detach().square().sum()) for p in made.parameters()) for made in (near, far)]
+    assert size[0] < 0.2 * size[1]
+
+
+def test_checkpoints_of_another_configuration_and_damaged_ones_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "c.pt"
+    _, tuner = filter_and_tuner(checkpoint=path)
+    tuner.run()
+    _, other = filter_and_tuner(TuningSettings(steps=12, folds=3, seed=3), checkpoint=path)
+    with pytest.raises(ValueError, match="another configuration: batch_size: 6 there, 16 here; folds: 4 there, 3 here"):
+        other.run()
+    content = path.read_bytes()
+    for size in (0, 100, len(content) // 2, len(content) - 20):
+        path.write_bytes(content[:size])
+        with pytest.raises(ValueError, match=r"c\.pt: not a readable checkpoint"):
+            filter_and_tuner(checkpoint=path)[1].run()
+    assert [file.name for file in tmp_path.iterdir()] == ["c.pt"]
+
+
+def test_checkpoints_execute_nothing(tmp_path: Path) -> None:
+    path, witness = tmp_path / "c.pt", tmp_path / "witness"
+
+    class Bomb:
+        def __reduce__(self):
+            return (open, (str(witness), "w"))
+
+    torch.save({"format": 1, "configuration": {}, "content": Bomb()}, path)
+    with pytest.raises(ValueError, match="not a readable checkpoint"):
+        load_checkpoint(path, {})
+    assert not witness.exists()
+    save_checkpoint(path, {"a": 1}, {"x": torch.ones(2)})
+    assert load_checkpoint(path, {"a": 1})["x"].tolist() == [1, 1]
+    with pytest.raises(FileNotFoundError):
+        load_checkpoint(tmp_path / "none.pt", {})
+
+
+def test_a_failed_write_leaves_the_old_checkpoint(tmp_path: Path) -> None:
+    path = tmp_path / "c.pt"
+    save_checkpoint(path, {}, {"x": 1})
+    with pytest.raises(Exception, match="pickle|lambda|local"):
+        save_checkpoint(path, {}, {"x": lambda: None})
+    assert load_checkpoint(path, {})["x"] == 1
+    assert [file.name for file in tmp_path.iterdir()] == ["c.pt"]
+
+
+def test_the_tool_counts_through_the_arm() -> None:
+    """Six joints observed through nothing but their mean: the gradient of the tool's distance reaches the noise."""
+    primitive = small_primitive(torch.float64)
+    six = torch.ones(5, dtype=torch.bool)
+    with pytest.raises(ValueError, match="tool term needs an arm"):
+        ForecastObjective(primitive, six, weights=Weights(tool=1.0))
+    arm = ForwardKinematicsLoss(RobotArm.ur5().double())
+    made = restrict(ebip(primitive, square_root=True), six)
+    state = made.initial_state()
+    state, _ = made.update(state, torch.zeros(5, dtype=torch.float64), SUBSETS["both"])
+    ends = made.forecast(state, torch.ones(1)).mean[0]
+    joints = torch.cat([ends, ends[:1]])
+    arm(joints, torch.zeros(6, dtype=torch.float64)).backward()
+    gradient = made.noise.measurement.whole.variance.raw.grad
+    assert gradient[:3].abs().min() > 0
+
+
+def test_bad_settings_are_named() -> None:
+    with pytest.raises(ValueError, match="no parameter matches"):
+        filter_and_tuner(TuningSettings(only=("nothing",)))
+    with pytest.raises(ValueError, match="too few for 13 folds"):
+        filter_and_tuner(TuningSettings(folds=13))
+    primitive = small_primitive()
+    objective = ForecastObjective(primitive, TARGETS)
+    with pytest.raises(ValueError, match="10 demonstrations, but the primitive has 24"):
+        Tuner(ebip(primitive), interactions(10), primitive, objective, TARGETS, SUBSETS)
