@@ -34,6 +34,8 @@ from torch_ebip.monitor import Monitor
 from torch_ebip.tuning import TuningSettings
 
 FRACTIONS = (0.43, 0.82)
+SAMPLES = 25
+"""How many samples of an interaction are used while tuning."""
 
 
 @dataclass(frozen=True)
@@ -148,6 +150,9 @@ def main(arguments: list[str] | None = None) -> None:
     if options.quick:
         tuning = replace(tuning, steps=min(options.steps, 20), batch_size=8, validate_every=5)
         count, scan = min(count, 100), 12
+    demonstrations, task = load(options.data, count, options.seed)
+    # Neighbouring samples say nearly the same, and a sample that stands for k costs a k-th.
+    tuning = replace(tuning, thinning=max(1, round(float(demonstrations.lengths.double().median()) / SAMPLES)))
     settings = {
         "data": options.data,
         "demonstrations": None if options.data else count,
@@ -157,7 +162,6 @@ def main(arguments: list[str] | None = None) -> None:
         "scan": scan,
         "tuning": asdict(tuning),
     }
-    demonstrations, task = load(options.data, count, options.seed)
     if not 1 <= options.folds <= len(demonstrations):
         raise SystemExit(
             f"--folds must be between 1 and the {len(demonstrations)} demonstrations, got {options.folds}"

@@ -36,7 +36,7 @@ def parameters(made: EnsembleFilter) -> dict[str, torch.Tensor]:
 
 
 def test_no_ensemble_contains_its_interaction(monkeypatch: pytest.MonkeyPatch) -> None:
-    made, tuner = filter_and_tuner()
+    _, tuner = filter_and_tuner()
     seen = []
     original = type(tuner)._members
 
@@ -65,7 +65,9 @@ def test_smaller_and_larger_ensembles(size: int) -> None:
 
 def test_tuning_improves_the_validation_loss_and_moves_the_noise() -> None:
     """From a noise that is a thousand times too large, which shuts the measurements out."""
-    settings = TuningSettings(steps=40, batch_size=8, validate_every=10, folds=4, thinning=2, learning_rate=0.3, pull=0)
+    settings = TuningSettings(
+        steps=40, batch_size=8, validate_every=10, folds=4, thinning=2, learning_rate=0.3, pull=0
+    )
     made, tuner = filter_and_tuner(settings, factor=1000.0)
     start = tuner.evaluate()["loss"]
     result = tuner.run()
@@ -111,15 +113,15 @@ def test_an_interrupted_run_ends_in_the_same_numbers(tmp_path: Path) -> None:
     uninterrupted = tuner.run()
     expected = parameters(made)
 
-    class Interrupted(Exception):
+    class InterruptionError(Exception):
         pass
 
     def stop(step: int, *_: float) -> None:
         if step == 9:  # one step after the checkpoint at 8
-            raise Interrupted
+            raise InterruptionError
 
     _, first = filter_and_tuner(checkpoint=tmp_path / "c.pt", progress=stop)
-    with pytest.raises(Interrupted):
+    with pytest.raises(InterruptionError):
         first.run()
     resumed, second = filter_and_tuner(checkpoint=tmp_path / "c.pt")
     result = second.run()
@@ -132,7 +134,9 @@ def test_an_interrupted_run_ends_in_the_same_numbers(tmp_path: Path) -> None:
 
 
 def test_only_the_named_parameters_are_tuned() -> None:
-    made, tuner = filter_and_tuner(TuningSettings(steps=4, folds=4, validate_every=2, only=("weighting.*", "inflation*")))
+    made, tuner = filter_and_tuner(
+        TuningSettings(steps=4, folds=4, validate_every=2, only=("weighting.*", "inflation*"))
+    )
     tuner.run()
     moved = {name for name, value in parameters(made).items() if value.abs().max() > 0}
     assert moved
@@ -140,7 +144,9 @@ def test_only_the_named_parameters_are_tuned() -> None:
 
 
 def test_stops_early_when_validation_no_longer_improves() -> None:
-    settings = TuningSettings(steps=400, learning_rate=3.0, batch_size=4, folds=4, validate_every=1, patience=3, clip=1e3)
+    settings = TuningSettings(
+        steps=400, learning_rate=3.0, batch_size=4, folds=4, validate_every=1, patience=3, clip=1e3
+    )
     _, tuner = filter_and_tuner(settings)
     result = tuner.run()
     assert result.stopped_early
@@ -161,7 +167,9 @@ def test_checkpoints_of_another_configuration_and_damaged_ones_are_refused(tmp_p
     _, tuner = filter_and_tuner(checkpoint=path)
     tuner.run()
     _, other = filter_and_tuner(TuningSettings(steps=12, folds=3, seed=3), checkpoint=path)
-    with pytest.raises(ValueError, match="another configuration: batch_size: 6 there, 16 here; folds: 4 there, 3 here"):
+    with pytest.raises(
+        ValueError, match="another configuration: batch_size: 6 there, 16 here; folds: 4 there, 3 here"
+    ):
         other.run()
     content = path.read_bytes()
     for size in (0, 100, len(content) // 2, len(content) - 20):
@@ -191,7 +199,7 @@ def test_checkpoints_execute_nothing(tmp_path: Path) -> None:
 def test_a_failed_write_leaves_the_old_checkpoint(tmp_path: Path) -> None:
     path = tmp_path / "c.pt"
     save_checkpoint(path, {}, {"x": 1})
-    with pytest.raises(Exception, match="pickle|lambda|local"):
+    with pytest.raises(Exception, match=r"pickle|lambda|local"):
         save_checkpoint(path, {}, {"x": lambda: None})
     assert load_checkpoint(path, {})["x"] == 1
     assert [file.name for file in tmp_path.iterdir()] == ["c.pt"]

@@ -162,9 +162,10 @@ def _shares(members: Tensor, weights: Tensor | None) -> Tensor:
 
 def inflate(members: Tensor, factor: Tensor | float, weights: Tensor | None = None) -> Tensor:
     """Scale the deviations from the mean of members [..., E, n] by a factor [...] (covariance by its square)."""
-    mean = ensemble_mean(members, weights).unsqueeze(-2)
-    scale = torch.as_tensor(factor, dtype=members.dtype, device=members.device)
-    return mean + (members - mean) * scale[..., None, None]
+    anomalies = members - ensemble_mean(members, weights).unsqueeze(-2)
+    # Added rather than scaled: a factor of exactly 1 leaves the members as they are, to the bit.
+    growth = torch.as_tensor(factor, dtype=members.dtype, device=members.device) - 1
+    return torch.addcmul(members, anomalies, growth[..., None, None])
 
 
 def _check(members: Tensor, projections: Tensor, y: Tensor, noise_cholesky: Tensor, observed: Tensor | None) -> None:

@@ -80,7 +80,7 @@ def test_the_papers_algorithm(monkeypatch: pytest.MonkeyPatch) -> None:
             for j in range(E):
                 X[j, 0] += X[j, 1] * dt
                 X[j, :2] += noise[j]
-        eps = draws.pop(0)[:, observed] * np.sqrt(np.diag(R))
+        eps = draws.pop(0) * np.sqrt(np.diag(R))
         HX = np.stack([h(x, x[0])[observed] for x in X])
         A, HA = X - X.mean(0), HX - HX.mean(0)
         S = HA.T @ HA / (E - 1) + R
@@ -190,7 +190,9 @@ def test_members_that_ran_past_the_end_are_called_back(square_root: bool, factor
     errors, before = [], []
     for index, trajectory in enumerate(interactions(20, seed=11, dtype=torch.float64)):
         quick = trajectory.nan_to_num().T.unsqueeze(0)
-        slow = torch.nn.functional.interpolate(quick, size=2 * quick.shape[-1], mode="linear", align_corners=True)[0].T
+        slow = torch.nn.functional.interpolate(quick, size=2 * quick.shape[-1], mode="linear", align_corners=True)[
+            0
+        ].T
         length = len(slow)
         observed = torch.tensor([True, True, True, False, False]).expand(length, 5).clone()
         observed[int(0.05 * length) : int(0.6 * length)] = False

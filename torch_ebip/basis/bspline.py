@@ -24,37 +24,52 @@ class BSplineBasis(Basis):
         ValueError: a negative degree, or fewer functions than degree + 1.
     """
 
-    knots: Tensor
+    pieces: Tensor  # [n_pieces, degree + 1, n_features], coefficients of powers of the local coordinate
 
     def __init__(self, n_features: int, degree: int = 3) -> None:
         if degree < 0 or n_features < degree + 1:
             raise ValueError(f"BSplineBasis: degree {degree} needs n_features >= {degree + 1}, got {n_features}")
         super().__init__(n_features)
         self.degree = degree
-        inner = torch.linspace(0, 1, n_features - degree + 1, dtype=torch.float64)
-        knots = torch.cat([inner.new_zeros(degree), inner, inner.new_ones(degree)])
-        self.register_buffer("knots", knots, persistent=False)
+        pieces = n_features - degree
+        # A piece is a polynomial of this degree in the local coordinate u in [0, 1]: found from degree + 1 points.
+        points = torch.linspace(0, 1, degree + 2, dtype=torch.float64)[:-1] + 0.5 / (degree + 1)
+        phases = (torch.arange(pieces, dtype=torch.float64)[:, None] + points) / pieces
+        vandermonde = points[:, None] ** torch.arange(degree + 1)
+        values = _cox_de_boor(phases, n_features, degree)
+        self.register_buffer("pieces", torch.linalg.solve(vandermonde, values), persistent=False)
 
     def evaluate(self, phase: Tensor) -> tuple[Tensor, Tensor]:
-        """Values and slopes by the Cox-de Boor recurrence; see `Basis.evaluate`."""
-        knots, degree = self.knots.to(phase), self.degree
-        pieces = self.n_features - degree
-        piece = (phase.detach() * pieces).floor().long().clamp(0, pieces - 1) + degree
-        values = torch.nn.functional.one_hot(piece, len(knots) - 1).to(phase.dtype)
-        slopes = torch.zeros_like(values)
-        x = phase.unsqueeze(-1)
-        for k in range(1, degree + 1):
-            left, right = knots[: -k - 1], knots[k + 1 :]
-            rising = _reciprocal(knots[k:-1] - left)
-            falling = _reciprocal(right - knots[1:-k])
-            if k == degree:
-                slopes = k * (values[..., :-1] * rising - values[..., 1:] * falling)
-            values = (x - left) * rising * values[..., :-1] + (right - x) * falling * values[..., 1:]
-        return values, slopes[..., : self.n_features]
+        """Values and slopes, from the polynomial pieces; see `Basis.evaluate`."""
+        pieces = self.n_features - self.degree
+        scaled = phase * pieces
+        piece = scaled.detach().floor().long().clamp(0, pieces - 1)
+        local = (scaled - piece).unsqueeze(-1)
+        coefficients = self.pieces.to(phase)[piece]
+        values, slopes = coefficients[..., -1, :], torch.zeros_like(coefficients[..., -1, :])
+        for k in range(self.degree - 1, -1, -1):  # Horner's scheme, for the value and its derivative
+            slopes = slopes * local + values
+            values = values * local + coefficients[..., k, :]
+        return values, slopes * pieces
 
     def extra_repr(self) -> str:
         """The settings; see `Basis.extra_repr`."""
         return f"n_features={self.n_features}, degree={self.degree}"
+
+
+def _cox_de_boor(phase: Tensor, n_features: int, degree: int) -> Tensor:
+    """Values [..., n_features] at phases [...] inside pieces, by the Cox-de Boor recurrence."""
+    pieces = n_features - degree
+    inner = torch.linspace(0, 1, pieces + 1, dtype=phase.dtype)
+    knots = torch.cat([inner.new_zeros(degree), inner, inner.new_ones(degree)])
+    piece = (phase * pieces).floor().long() + degree
+    values = torch.nn.functional.one_hot(piece, len(knots) - 1).to(phase)
+    x = phase.unsqueeze(-1)
+    for k in range(1, degree + 1):
+        left, right = knots[: -k - 1], knots[k + 1 :]
+        rising, falling = _reciprocal(knots[k:-1] - left), _reciprocal(right - knots[1:-k])
+        values = (x - left) * rising * values[..., :-1] + (right - x) * falling * values[..., 1:]
+    return values
 
 
 def _reciprocal(width: Tensor) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -78,21 +78,42 @@ class StackedBasis(nn.Module):
 
     def project(self, phase: Tensor, weights: Tensor) -> Tensor:
         """h(phi, w): phases [...] and weights [..., n_weights] of shapes that broadcast -> values [..., D]."""
-        return self._project(phase, weights, lambda basis, at: basis(at))
+        return self.project_many(phase, [weights])[0]
 
     def project_derivative(self, phase: Tensor, weights: Tensor) -> Tensor:
         """dh/dphi, shapes as `project`: the first column of the paper's Jacobian (equation of H_t)."""
-        return self._project(phase, weights, lambda basis, at: basis.derivative(at))
+        return self._project([basis.derivative(phase) for basis in self._families()], weights, None)
 
-    def _project(self, phase: Tensor, weights: Tensor, features: Callable[[Basis, Tensor], Tensor]) -> Tensor:
+    def project_many(
+        self, phase: Tensor, weights: Sequence[Tensor], dofs: Sequence[int] | None = None
+    ) -> list[Tensor]:
+        """`project` of several sets of weights at the same phases, which are evaluated once.
+
+        Args:
+            phase: [...].
+            weights: each [..., n_weights].
+            dofs: ascending indices of the k DoFs that are wanted; default: all.
+
+        Returns:
+            For each set of weights values [..., k].
+        """
+        features = [basis(phase) for basis in self._families()]
+        return [self._project(features, part, dofs) for part in weights]
+
+    def _families(self) -> list[Basis]:
+        return list(self.unique)  # type: ignore[arg-type]
+
+    def _project(self, features: Sequence[Tensor], weights: Tensor, dofs: Sequence[int] | None) -> Tensor:
         if weights.shape[-1] != self.n_weights:
             raise ValueError(f"weights must end in {self.n_weights}, got {tuple(weights.shape)}")
-        evaluated = [features(basis, phase) for basis in self.unique]  # type: ignore[arg-type]
         parts = []
         for run in self._runs:
-            count = run.dofs.stop - run.dofs.start
-            block = weights[..., run.weights].reshape(*weights.shape[:-1], count, -1)
-            parts.append((block @ evaluated[run.basis].unsqueeze(-1)).squeeze(-1))
+            start, stop = run.dofs.start, run.dofs.stop
+            wanted = list(range(start, stop)) if dofs is None else [dof for dof in dofs if start <= dof < stop]
+            if wanted:
+                block = weights[..., run.weights].reshape(*weights.shape[:-1], stop - start, -1)
+                values = (block @ features[run.basis].unsqueeze(-1)).squeeze(-1)
+                parts.append(values if len(wanted) == stop - start else values[..., [dof - start for dof in wanted]])
         return torch.cat(parts, dim=-1)
 
     def _find_runs(self) -> list[_Run]:

@@ -12,7 +12,9 @@ from torch import Tensor, nn
 from torch_ebip import functional
 from torch_ebip.filters.base import Filter, Forecast
 from torch_ebip.filters.evidence import Evidence, EvidenceWeighting
+from torch_ebip.filters.interaction import BasisProjection
 from torch_ebip.filters.localisation import Localisation
+from torch_ebip.functional import Taper
 
 
 class EnsembleState(NamedTuple):
@@ -134,12 +136,20 @@ class EnsembleFilter(Filter):
     def _update(
         self, state: EnsembleState, y: Tensor, observed: Tensor, generator: torch.Generator | None
     ) -> tuple[EnsembleState, Tensor]:
-        """Step 3: x = x + K (y + eps - h(x))."""
-        members, weights = state.members, state.weights
-        projections = self.observation(members)
-        deviation = self.noise.measurement(self._phase_or_none(state)) / math.sqrt(self.thinning)
-        factor = torch.diag_embed(deviation)
+        """Step 3: x = x + K (y + eps - h(x)), over the DoFs that some entry of the batch measured."""
+        measured = observed.reshape(-1, self.n_dofs).any(0)
+        if not bool(measured.any()):
+            return state, state.members.new_zeros(observed.shape[:-1])
+        rows = None if bool(measured.all()) else measured.nonzero().squeeze(-1)
+        members, weights, evidence = state.members, state.weights, state.evidence
+        phase = self._phase_or_none(state)
+        deviation = self.noise.measurement(phase) / math.sqrt(self.thinning)
         taper = None if self.localisation is None else self.localisation()
+        projections, origins = self._project_rows(state, rows)
+        if rows is not None:
+            y, observed, deviation = y[..., rows], observed[..., rows], deviation[..., rows]
+            taper = None if taper is None else Taper(taper.state[:, rows], taper.observation[rows][:, rows])
+        factor = torch.diag_embed(deviation)
         try:
             if self.square_root:
                 updated, likelihood = functional.square_root_update(
@@ -153,20 +163,30 @@ class EnsembleFilter(Filter):
                     members, projections, y, factor, draws, observed, taper, weights
                 )
         except functional.FactorisationError as error:
-            names = "" if self.dof_names is None else f" ({', '.join(self.dof_names[i] for i in error.dofs)})"
-            raise ValueError(f"{error}{names}") from error
+            raise ValueError(f"{error}{self._names(error.dofs, rows)}") from error
         if self.inflation is not None:
-            grown = functional.inflate(updated, self._inflation_factor(members) ** self.thinning, weights)
-            updated = torch.where(observed.any(-1)[..., None, None], grown, updated)
-        return EnsembleState(updated, self._weigh(state.evidence, updated, y, observed)), likelihood
+            growth = torch.where(observed.any(-1), self._inflation_factor(members) ** self.thinning, 1)
+            updated = functional.inflate(updated, growth, weights)
+        if self.weighting is not None and evidence is not None and origins is not None and phase is not None:
+            columns = self.columns if rows is None else rows if self.columns is None else self.columns[rows]
+            evidence = self.weighting.learn(evidence, origins, y, observed, phase, columns)
+        return EnsembleState(updated, evidence), likelihood
 
-    def _weigh(self, evidence: Evidence | None, members: Tensor, y: Tensor, observed: Tensor) -> Evidence | None:
-        """Take a sample in as evidence for the demonstrations that the members came from."""
-        if self.weighting is None or evidence is None:
-            return evidence
-        projections = self.observation(torch.cat([members[..., :2], evidence.origin], dim=-1))
-        phase = functional.ensemble_mean(members[..., :1], evidence.weights).squeeze(-1)
-        return self.weighting.learn(evidence, projections, y, observed, phase, self.columns)
+    def _project_rows(self, state: EnsembleState, rows: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        """h of the members and, for the evidence, of the demonstrations they came from, at the members' phases."""
+        if isinstance(self.observation, BasisProjection):
+            dofs = None if rows is None else rows.tolist()
+            others = () if state.evidence is None else (state.evidence.origin,)
+            projections, *origins = self.observation.rows(state.members, dofs, *others)
+            return projections, origins[0] if origins else None
+        projections = self.observation(state.members)
+        return projections if rows is None else projections[..., rows], None
+
+    def _names(self, dofs: list[int], rows: Tensor | None) -> str:
+        """The names of failing rows, in brackets, if there are any."""
+        if self.dof_names is None:
+            return ""
+        return f" ({', '.join(self.dof_names[i if rows is None else int(rows[i])] for i in dofs)})"
 
     def _inflation_factor(self, members: Tensor) -> Tensor:
         value = self.inflation.value if isinstance(self.inflation, nn.Module) else self.inflation

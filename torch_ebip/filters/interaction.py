@@ -5,6 +5,8 @@ State: phase, phase velocity, weights.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 
@@ -29,10 +31,12 @@ class ConstantVelocityPhase(nn.Module):
 
     def forward(self, members: Tensor, dt: Tensor) -> Tensor:
         """Members [..., E, n] after dt [...] seconds."""
-        phase = members[..., :1] + members[..., 1:2] * dt[..., None, None]
+        # One split instead of several slices: its backward pass is one concatenation.
+        phase, velocity, weights = members.tensor_split((1, 2), dim=-1)
+        phase = phase + velocity * dt[..., None, None]
         excess = phase - phase.clamp(0, 1)
         phase = phase - excess * excess.abs() / (self.overrun + excess.abs())
-        return torch.cat([phase, members[..., 1:]], dim=-1)
+        return torch.cat([phase, velocity, weights], dim=-1)
 
 
 class BasisProjection(nn.Module):
@@ -48,7 +52,16 @@ class BasisProjection(nn.Module):
 
     def forward(self, members: Tensor) -> Tensor:
         """Projections [..., E, D] of members [..., E, n]."""
-        return self.basis.project(members[..., 0], members[..., 2:])
+        return self.rows(members, None)[0]
+
+    def rows(self, members: Tensor, dofs: Sequence[int] | None, *others: Tensor) -> list[Tensor]:
+        """Projections [..., E, k] of some DoFs (ascending indices; None for all).
+
+        First those of members [..., E, n], then those of ``others``, weights [..., E, n_weights] that take the
+        place of the members' own.
+        """
+        phase, _, weights = members.tensor_split((1, 2), dim=-1)
+        return self.basis.project_many(phase.squeeze(-1), [weights, *others], dofs)
 
     def phase(self, members: Tensor) -> Tensor:
         """Phase [..., E] of each of the members [..., E, n]."""

@@ -97,14 +97,13 @@ class InteractionNoise(nn.Module):
 
     def forward(self, members: Tensor, dt: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Members [..., E, n] with noise for steps dt [...] seconds added."""
-        factor = self.phase.cholesky(dt)
-        steps = _normal_like(members[..., :2], generator) @ factor.transpose(-1, -2)
-        if self.weights is None:
-            return torch.cat([members[..., :2] + steps, members[..., 2:]], dim=-1)
-        scale = self.weights.scale(dt)
-        scale = scale if self.columns is None else scale[..., self.columns]
-        draws = _normal_like(members[..., 2:], generator)
-        return members + torch.cat([steps, draws * scale.unsqueeze(-2)], dim=-1)
+        phase, weights = members.tensor_split((2,), dim=-1)
+        phase = phase + _normal_like(phase, generator) @ self.phase.cholesky(dt).transpose(-1, -2)
+        if self.weights is not None:
+            scale = self.weights.scale(dt)
+            scale = scale if self.columns is None else scale[..., self.columns]
+            weights = weights + _normal_like(weights, generator) * scale.unsqueeze(-2)
+        return torch.cat([phase, weights], dim=-1)
 
 
 def _normal_like(members: Tensor, generator: torch.Generator | None) -> Tensor:
