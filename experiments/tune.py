@@ -57,7 +57,10 @@ class Job:
 def load(data: str | None, count: int, seed: int) -> tuple[Demonstrations, Task]:
     """Recordings and what is asked of them."""
     if data is not None:
-        demonstrations = Demonstrations.load(data)
+        try:
+            demonstrations = Demonstrations.load(data)
+        except (ValueError, OSError) as error:
+            raise SystemExit(str(error)) from error
         layout = demonstrations.layout
         sensors = [modality.name for modality in layout.modalities if not modality.controlled]
         targets = [modality.name for modality in layout.modalities if modality.controlled]
@@ -101,7 +104,9 @@ def run_fold(job: Job, progress: Callable[[int, float, float], None] | None = No
     with Monitor(folder / "tensorboard") as monitor:
         config = {**asdict(job), "tuning": None, **asdict(job.tuning)}
         monitor.text("configuration", "\n".join(f"- `{key}`: {value}" for key, value in config.items()))
-        monitor.text("basis", f"```\n{selection_table(rank_candidates(known))}\n```")
+        choice = selection_table(rank_candidates(known))
+        (folder / "basis.txt").write_text(f"{choice}\n")
+        monitor.text("basis", f"```\n{choice}\n```")
         factor = best_factor(problem, scaled, job.tuning, job.scan, FACTORS, folder / "scan_scaled.json")
         start = best_factor(problem, tunable, job.tuning, job.scan, [factor], folder / "scan_tunable.json")
         tuned = tunable(primitive, start)

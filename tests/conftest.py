@@ -10,6 +10,7 @@ import torch
 
 from torch_ebip import BSplineBasis, Demonstrations, InteractionPrimitive, Layout, Modality, StackedBasis
 
+torch.set_num_threads(1)
 SHARED = Path(__file__).parents[2] / "shared" / "data" / "handover.npz"
 
 

@@ -15,7 +15,9 @@ from torch_ebip.basis import (
 )
 from torch_ebip.demonstrations import Demonstrations
 from torch_ebip.filters import EnsembleFilter, Filter, Forecast, Trace, ebip
+from torch_ebip.kinematics import RobotArm
 from torch_ebip.layout import Layout, Modality
+from torch_ebip.losses import ForwardKinematicsLoss
 from torch_ebip.primitive import InteractionPrimitive
 
 __all__ = [
@@ -25,11 +27,13 @@ __all__ = [
     "EnsembleFilter",
     "Filter",
     "Forecast",
+    "ForwardKinematicsLoss",
     "GaussianBasis",
     "InteractionPrimitive",
     "Layout",
     "Modality",
     "PolynomialBasis",
+    "RobotArm",
     "SigmoidBasis",
     "StackedBasis",
     "Trace",

@@ -114,8 +114,8 @@ def square_root_update(
 
     The mean moves by K (y - mean HX); the anomalies by A - K~ HA with
     K~ = P H' V^-T (V + U)^-1, V V' = S, U U' = R, which satisfies
-    (I - K~ H) P (I - K~ H)' + 0 = P - P H' S^-1 H P for any factors; here they are Cholesky factors, so that
-    two triangular solves do it and gradients exist even where eigenvalues coincide.
+    (I - K~ H) P (I - K~ H)' = P - P H' S^-1 H P for any factors; here they are Cholesky factors, so that two
+    triangular solves do it and gradients exist even where eigenvalues coincide.
     With a taper the same formulas use the tapered covariances; the identity then holds approximately.
 
     Arguments, returns and errors as `ensemble_update`, without perturbations.

@@ -238,12 +238,13 @@ class Tuner:
         return float(loss.detach())
 
     @torch.no_grad()
-    def evaluate(self, interactions: Tensor | None = None) -> dict[str, float]:
+    def evaluate(self, interactions: Tensor | None = None, shares: Tensor | None = None) -> dict[str, float]:
         """Scores of the filter as it is, always at the same horizons and draws; nothing is reported or changed.
 
         Args:
             interactions: int64 [B], which demonstrations; default: those kept for validation. Each is filtered
                 by an ensemble that does not contain it.
+            shares: [K], of an interaction that are shown; default: four evenly within the settings' horizons.
 
         Returns:
             ``loss``, its terms, ``subset/NAME`` the loss of each subset, and ``spread`` and ``error`` of the
@@ -251,7 +252,7 @@ class Tuner:
         """
         interactions = self.validating if interactions is None else interactions
         low, high = self.settings.horizons
-        shares = low + (high - low) * (torch.arange(4) + 0.5) / 4
+        shares = low + (high - low) * (torch.arange(4) + 0.5) / 4 if shares is None else shares
         totals: dict[str, list[float]] = {}
         spreads = []
         for name, subset in self.subsets.items():

@@ -1,0 +1,149 @@
+"""The main job at a small size, through its command line: what it writes, resumes, refuses."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments import tune
+from experiments.evaluate import FilterMethod, MeanMethod, NearestMethod, Task, evaluate
+from experiments.methods import scaled
+from tests.conftest import interactions, small_primitive
+from torch_ebip import Demonstrations, Layout, Modality
+
+SMALL = ["--steps", "3", "--quick", "--seed", "5"]
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("data") / "made.npz"
+    interactions(30).save(path)
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def finished(recordings: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "run"
+    tune.main(["--data", recordings, *SMALL, "--out", str(out)])
+    return out
+
+
+def test_a_run_folder_is_complete(finished: Path) -> None:
+    names = {path.name for path in finished.iterdir()}
+    assert {"config.json", "results.json", "results.png", "forecasts.png", "noise.png", "checkpoint.pt"} <= names
+    assert list((finished / "tensorboard").glob("events*"))
+    results = json.loads((finished / "results.json").read_text())
+    assert results["experiment"] == "tune"
+    methods = {row["method"] for row in results["rows"]}
+    assert methods == {"mean", "nearest", "ebip", "ebip_scaled", "ebip_tuned"}
+    assert {row["observed"] for row in results["rows"]} == {0.43, 0.82}
+    assert {row["metric"] for row in results["rows"]} == {"mse", "mae", "coverage_95", "crps", "phase_error"}
+    assert all(row["n"] == 6 for row in results["rows"])
+
+
+def test_a_finished_run_stops(finished: Path, recordings: str) -> None:
+    with pytest.raises(SystemExit, match="finished run"):
+        tune.main(["--data", recordings, *SMALL, "--out", str(finished)])
+
+
+def test_two_runs_of_a_seed_agree(finished: Path, recordings: str, tmp_path: Path) -> None:
+    tune.main(["--data", recordings, *SMALL, "--out", str(tmp_path / "again")])
+    first, second = (json.loads((path / "results.json").read_text()) for path in (finished, tmp_path / "again"))
+    assert [row["mean"] for row in first["rows"]] == pytest.approx([row["mean"] for row in second["rows"]], rel=1e-4)
+
+
+def test_a_killed_run_resumes_to_the_same_table(recordings: str, tmp_path: Path) -> None:
+    """Three folds in processes of their own; killed after the first finished one."""
+    arguments = ["--data", recordings, *SMALL, "--folds", "3", "--workers", "1", "--out"]
+    command = [sys.executable, "-m", "experiments.tune", *arguments]
+    root = Path(tune.__file__).parents[1]
+    run = tmp_path / "killed"
+    started = subprocess.Popen([*command, str(run)], cwd=root, start_new_session=True, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not (run / "fold-00" / "values.json").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.killpg(started.pid, signal.SIGKILL)
+    started.wait()
+    assert not (run / "results.json").exists()
+    kept = (run / "fold-00" / "values.json").stat().st_mtime_ns
+    subprocess.run([*command, str(run)], cwd=root, check=True, capture_output=True)
+    assert (run / "fold-00" / "values.json").stat().st_mtime_ns == kept
+    subprocess.run([*command, str(tmp_path / "whole")], cwd=root, check=True, capture_output=True)
+    resumed, whole = (json.loads((path / "results.json").read_text()) for path in (run, tmp_path / "whole"))
+    assert resumed["rows"] == whole["rows"]
+    assert all(row["n"] == 30 for row in whole["rows"])
+
+
+def test_test_interactions_are_seen_by_nobody(recordings: str) -> None:
+    jobs = [tune.Job(fold, 5, recordings, 0, 3, 0.2, 4, 1, "", tune.TuningSettings()) for fold in range(5)]
+    tests = []
+    for job in jobs:
+        training, testing = tune.split(job, 31)
+        assert not set(training.tolist()) & set(testing.tolist())
+        tests += testing.tolist()
+    assert sorted(tests) == list(range(31))
+    held = tune.split(dataclasses.replace(jobs[0], folds=1), 30)
+    assert len(held[1]) == 6
+
+
+def test_a_target_is_never_shown(recordings: str) -> None:
+    """The controlled DoFs reach no method before phase 1: garbage there changes no answer."""
+    made = interactions(6, seed=3)
+    task = Task({"all": ["hand", "gaze"]}, (0.43, 0.82), [], ["arm"], {}, None)
+    primitive = small_primitive()
+    methods = {
+        "ebip": FilterMethod(scaled(primitive, 10.0), 0),
+        "nearest": NearestMethod(primitive),
+        "mean": MeanMethod(primitive),
+    }
+    spoiled = [trajectory.clone() for trajectory in made]
+    for trajectory in spoiled:
+        trajectory[:-1, 3:] = 99.0
+        trajectory[int(0.9 * len(trajectory)) :, :3] = 99.0  # nor is what comes after the fraction
+    a = evaluate(task, methods, made)
+    b = evaluate(task, methods, Demonstrations(made.layout, spoiled, made.rate))
+    for cell, values in a.items():
+        for name, array in values.items():
+            np.testing.assert_array_equal(array, b[cell][name], err_msg=f"{cell} {name}")
+
+
+def test_nearest_finds_the_same_interaction() -> None:
+    made = interactions()
+    task = Task({"all": ["hand", "gaze"]}, (0.82,), [], ["arm"], {}, None)
+    values = evaluate(
+        task, {"nearest": NearestMethod(small_primitive()), "mean": MeanMethod(small_primitive())}, made
+    )
+    mae = next(methods for cell, methods in values.items() if cell.metric == "mae")
+    assert np.median(mae["nearest"]) < 0.05
+    assert np.median(mae["mean"]) > 0.2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--data", "nowhere.npz"], "nowhere.npz"),
+        (["--folds", "31"], "--folds must be between 1 and the 30"),
+        (["--folds", "0"], "--folds must be between"),
+    ],
+)
+def test_bad_arguments_are_named(arguments: list[str], message: str, recordings: str, tmp_path: Path) -> None:
+    base = [] if "--data" in arguments else ["--data", recordings]
+    with pytest.raises(SystemExit, match=message):
+        tune.main([*base, *arguments, "--out", str(tmp_path / "run")])
+    assert not (tmp_path / "run").exists()
+
+
+def test_recordings_without_a_controlled_modality_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "watch.npz"
+    made = interactions(12)
+    layout = Layout([Modality("hand", ["hand.x", "hand.y"], "m")])
+    Demonstrations(layout, [trajectory[:, :2] for trajectory in made], 30.0).save(path)
+    with pytest.raises(SystemExit, match="needs observed and controlled"):
+        tune.main(["--data", str(path)])
