@@ -24,13 +24,15 @@ COLOURS = {"mean": "0.6", "nearest": "0.4", "ebip": "tab:red", "ebip_scaled": "t
 
 def results_figure(results: Mapping[str, Any], panels: Sequence[tuple[str, str | None]]) -> Figure:
     """Mean and standard error of every method in every cell, a panel for each (metric, modality)."""
+    methods = list(dict.fromkeys(row["method"] for row in results["rows"]))
     figure, axes = plt.subplots(len(panels), 1, figsize=(9, 2.6 * len(panels)), squeeze=False, layout="constrained")
     for axis, (metric, modality) in zip(axes[:, 0], panels, strict=True):
         rows = [row for row in results["rows"] if (row["metric"], row["modality"]) == (metric, modality)]
         cells = list(dict.fromkeys((row["subset"], row["observed"]) for row in rows))
-        methods = list(dict.fromkeys(row["method"] for row in rows))
         for i, method in enumerate(methods):
             mine = [row for row in rows if row["method"] == method]
+            if not mine:
+                continue
             at = [cells.index((row["subset"], row["observed"])) + 0.14 * (i - (len(methods) - 1) / 2) for row in mine]
             errors = [row["standard_error"] or 0.0 for row in mine]
             means = [row["mean"] for row in mine]
