@@ -108,11 +108,13 @@ class NearestMethod:
         basis = primitive.basis.select(used)
         weights = primitive.weights[:, used[primitive.basis.dof_of_weight()]]
         phase = torch.arange(y.shape[1])[:, None] / primitive.rate * primitive.phase_velocity
-        paths = basis.project(phase, weights) / primitive.value_variance[used].sqrt()
+        variance = primitive.value_variance[used]
+        deviation = torch.where(variance > 0, variance, torch.inf).sqrt()
+        paths = basis.project(phase, weights) / deviation
         chosen = torch.empty_like(keep)
         for i in range(len(y)):
             seen = observed[i][:, used]
-            values = torch.where(seen, y[i][:, used], 0) / primitive.value_variance[used].sqrt()
+            values = torch.where(seen, y[i][:, used], 0) / deviation
             squares = (torch.where(seen.unsqueeze(1), paths - values.unsqueeze(1), 0)).square().sum(-1)
             chosen[i] = squares.cumsum(0)[keep[i]].argmin(-1)
         members = self.ends[:, dofs][chosen].unsqueeze(-2)

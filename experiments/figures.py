@@ -28,6 +28,9 @@ def results_figure(results: Mapping[str, Any], panels: Sequence[tuple[str, str |
     figure, axes = plt.subplots(len(panels), 1, figsize=(9, 2.6 * len(panels)), squeeze=False, layout="constrained")
     for axis, (metric, modality) in zip(axes[:, 0], panels, strict=True):
         rows = [row for row in results["rows"] if (row["metric"], row["modality"]) == (metric, modality)]
+        if not rows:
+            axis.set_axis_off()
+            continue
         cells = list(dict.fromkeys((row["subset"], row["observed"]) for row in rows))
         for i, method in enumerate(methods):
             mine = [row for row in rows if row["method"] == method]

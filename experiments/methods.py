@@ -84,11 +84,12 @@ def best_factor(
         settings: of the ensembles and horizons, the same as for tuning.
         interactions: how many training interactions decide.
         factors: grid; half-decades around its best one are tried too.
-        record: file of the losses, read again if it exists.
+        record: file of the losses, written when all are known; if it exists, its best factor is returned.
     """
-    losses: dict[float, float] = {}
     if record.exists():
-        losses = {float(factor): loss for factor, loss in json.loads(record.read_text()).items()}
+        stored = {float(factor): loss for factor, loss in json.loads(record.read_text()).items()}
+        return min(stored, key=lambda factor: stored[factor])
+    losses: dict[float, float] = {}
     order = torch.randperm(len(problem.primitive), generator=torch.Generator().manual_seed(settings.seed + 1))
 
     def measure(factors: Sequence[float]) -> None:
@@ -99,7 +100,7 @@ def best_factor(
 
     measure(factors)
     best = min(losses, key=lambda factor: losses[factor])
-    measure((round(best / 10**0.5, 6), round(best * 10**0.5, 6)))
+    measure([float(f"{best * 10**half:.4g}") for half in (-0.5, 0.5)])
     write_json(record, losses)
     return min(losses, key=lambda factor: losses[factor])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import platform
 import shutil
 import subprocess
@@ -22,7 +23,7 @@ class RunFolder:
         experiment: its name.
         settings: everything that decides the result; an unfinished run is resumed only with the same.
         out: the folder; default ``runs/EXPERIMENT/STAMP``.
-        force: start over, whatever is there.
+        force: start over, also over a finished run of this experiment; nothing else is ever removed.
 
     Raises:
         SystemExit: the folder cannot be written, holds a finished run, another experiment, other settings, or
@@ -38,23 +39,30 @@ class RunFolder:
         asked = json.loads(json.dumps(dict(settings)))
         if self.path.exists() and not self.path.is_dir():
             raise SystemExit(f"{self.path} is a file, expected a folder to write the run to")
-        if self.path.is_dir() and any(self.path.iterdir()) and not config.exists():
-            raise SystemExit(f"{self.path} holds files but no run; choose another --out")
-        if config.exists() and force:
+        if self.path.is_dir() and any(self.path.iterdir()):
+            stored = self._stored(config, experiment)
+            if not force:
+                self._check(stored, asked)
+                print(f"resuming {self.path}")
+                return
             shutil.rmtree(self.path)
-        if config.exists():
-            self._check(json.loads(config.read_text()), experiment, asked)
-            print(f"resuming {self.path}")
-            return
         try:
             write_json(config, {"experiment": experiment, "settings": asked, **_environment()})
         except OSError as error:
             raise SystemExit(f"{self.path} cannot be written: {error}") from error
 
-    def _check(self, stored: Mapping[str, Any], experiment: str, asked: Mapping[str, Any]) -> None:
-        if stored["experiment"] != experiment:
-            raise SystemExit(f"{self.path} holds a run of {stored['experiment']}, not of {experiment}")
-        theirs = stored["settings"]
+    def _stored(self, config: Path, experiment: str) -> dict[str, Any]:
+        """The settings of the run that the folder holds; SystemExit if it holds none of this experiment."""
+        try:
+            content = json.loads(config.read_text())
+            found, settings = content["experiment"], dict(content["settings"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise SystemExit(f"{self.path} holds files but no run; choose another --out") from error
+        if found != experiment:
+            raise SystemExit(f"{self.path} holds a run of {found}, not of {experiment}")
+        return settings
+
+    def _check(self, theirs: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
         names = sorted({*theirs, *asked})
         differing = [
             f"{n}: {theirs.get(n)} there, {asked.get(n)} here" for n in names if theirs.get(n) != asked.get(n)
@@ -75,7 +83,15 @@ class RunFolder:
 def write_json(path: Path, content: Any) -> None:
     """Write JSON atomically; numbers that are not finite become null."""
     with atomic_write(path) as file:
-        file.write((json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
+        file.write((json.dumps(_finite(content), indent=1, allow_nan=False) + "\n").encode())
+
+
+def _finite(content: Any) -> Any:
+    if isinstance(content, dict):
+        return {key: _finite(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_finite(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
 def _environment() -> dict[str, Any]:

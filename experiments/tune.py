@@ -56,6 +56,8 @@ class Job:
 
 def load(data: str | None, count: int, seed: int) -> tuple[Demonstrations, Task]:
     """Recordings and what is asked of them."""
+    if count < 1:
+        raise SystemExit(f"--demonstrations must be at least 1, got {count}")
     if data is not None:
         try:
             demonstrations = Demonstrations.load(data)
@@ -96,7 +98,8 @@ def run_fold(job: Job, progress: Callable[[int, float, float], None] | None = No
     layout = demonstrations.layout
     training, testing = split(job, len(demonstrations))
     known, tests = demonstrations.subset(training), demonstrations.subset(testing)
-    basis = select_basis(known)
+    ranking = rank_candidates(known)
+    basis = select_basis(known, ranking=ranking)
     primitive = InteractionPrimitive.fit(known, basis)
     subsets = {name: layout.mask(names) for name, names in task.subsets.items()}
     arm = None if task.arm is None else (task.arm[0], layout.mask([task.arm[1]]))
@@ -104,7 +107,7 @@ def run_fold(job: Job, progress: Callable[[int, float, float], None] | None = No
     with Monitor(folder / "tensorboard") as monitor:
         config = {**asdict(job), "tuning": None, **asdict(job.tuning)}
         monitor.text("configuration", "\n".join(f"- `{key}`: {value}" for key, value in config.items()))
-        choice = selection_table(rank_candidates(known))
+        choice = selection_table(ranking)
         (folder / "basis.txt").write_text(f"{choice}\n")
         monitor.text("basis", f"```\n{choice}\n```")
         factor = best_factor(problem, scaled, job.tuning, job.scan, FACTORS, folder / "scan_scaled.json")
@@ -171,6 +174,12 @@ def main(arguments: list[str] | None = None) -> None:
         raise SystemExit(
             f"--folds must be between 1 and the {len(demonstrations)} demonstrations, got {options.folds}"
         )
+    held = round(test * len(demonstrations)) if options.folds == 1 else -(-len(demonstrations) // options.folds)
+    if held < 1 or len(demonstrations) - held < 2 * tuning.folds:
+        raise SystemExit(
+            f"{len(demonstrations)} demonstrations with {held} held out are too few: tuning filters each of the "
+            f"others by the rest in {tuning.folds} folds, and needs {2 * tuning.folds} of them"
+        )
     run = RunFolder("tune", settings, options.out, options.force)
     workers = max(1, min(options.workers or os.cpu_count() or 1, options.folds))
     threads = max(1, (os.cpu_count() or 1) // workers)
@@ -180,7 +189,10 @@ def main(arguments: list[str] | None = None) -> None:
         for fold in range(options.folds)
     ]  # fmt: skip
     print(demonstrations)
-    values = _single(jobs[0]) if len(jobs) == 1 else _folds(jobs, workers, run.path)
+    try:
+        values = _single(jobs[0]) if len(jobs) == 1 else _folds(jobs, workers)
+    except ValueError as error:
+        raise SystemExit(f"{run.path}: {error}") from error
     results = {
         "experiment": "tune",
         "dataset": {
@@ -198,8 +210,8 @@ def main(arguments: list[str] | None = None) -> None:
     if task.arm is not None:
         panels = [("mse", "robot"), ("mae", "ball"), ("tool_error", None)]
     panels.append(("coverage_95", task.targets[0]))
-    results_figure(results, panels).savefig(run.path / "results.png", dpi=110)
     write_json(run.results, results)
+    results_figure(results, panels).savefig(run.path / "results.png", dpi=110)
     print_tables(results)
     for report in results["reports"][:1]:
         print(f"state: {report['n_weights']} weights; factor on R: {report['factor_scaled']:.3g} (ebip_scaled)")
@@ -217,7 +229,7 @@ def _single(job: Job) -> Values:
         return run_fold(job, show)
 
 
-def _folds(jobs: list[Job], workers: int, folder: Path) -> Values:
+def _folds(jobs: list[Job], workers: int) -> Values:
     """Folds in processes of their own; what is finished is kept if the run is interrupted."""
     merged: list[Values] = [{} for _ in jobs]
     context = multiprocessing.get_context("spawn")

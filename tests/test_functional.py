@@ -28,7 +28,7 @@ def problem(*batch: int, E: int = 9, n: int = 6, D: int = 4, dtype: torch.dtype 
         return torch.randn(*shape, generator=g, dtype=torch.float64)
 
     members, H = draw(*batch, E, n), draw(D, n)
-    factor = torch.linalg.cholesky(draw(D, D) @ draw(D, D).T * 0 + torch.eye(D) + 0.3 * torch.ones(D, D))
+    factor = torch.linalg.cholesky(torch.eye(D, dtype=torch.float64) + 0.3)
     y, perturbations = draw(*batch, D), draw(*batch, E, D)
     tensors = (members, members @ H.T, y, factor.expand(*batch, D, D), perturbations, H)
     return tuple(tensor.to(dtype) for tensor in tensors)

@@ -179,6 +179,21 @@ def test_checkpoints_of_another_configuration_and_damaged_ones_are_refused(tmp_p
     assert [file.name for file in tmp_path.iterdir()] == ["c.pt"]
 
 
+def test_a_checkpoint_of_another_start_is_refused(tmp_path: Path) -> None:
+    filter_and_tuner(checkpoint=tmp_path / "c.pt")[1].run()
+    _, other = filter_and_tuner(factor=1000.0, checkpoint=tmp_path / "c.pt")
+    with pytest.raises(ValueError, match=r"another configuration: filter_buffers.*measurement\.variance\.start"):
+        other.run()
+
+
+def test_horizons_stay_inside_however_coarse_the_thinning(tmp_path: Path) -> None:
+    _, tuner = filter_and_tuner(TuningSettings(folds=4, thinning=10, horizons=(0.9, 1.0)))
+    shares = torch.tensor([[0.97, 1.0]]).expand(24, 2)
+    _, trace, (_, _, now, _) = tuner._filter(torch.arange(24), SUBSETS["both"], shares, torch.Generator())
+    assert now.max() <= 1
+    assert trace.kept is not None
+
+
 def test_checkpoints_execute_nothing(tmp_path: Path) -> None:
     path, witness = tmp_path / "c.pt", tmp_path / "witness"
 
@@ -209,6 +224,8 @@ def test_the_tool_counts_through_the_arm() -> None:
     """Six joints observed through nothing but their mean: the gradient of the tool's distance reaches the noise."""
     primitive = small_primitive(torch.float64)
     six = torch.ones(5, dtype=torch.bool)
+    with pytest.raises(ValueError, match="end differently"):
+        ForecastObjective(primitive, ~six)
     with pytest.raises(ValueError, match="tool term needs an arm"):
         ForecastObjective(primitive, six, weights=Weights(tool=1.0))
     arm = ForwardKinematicsLoss(RobotArm.ur5().double())
@@ -229,5 +246,12 @@ def test_bad_settings_are_named() -> None:
         filter_and_tuner(TuningSettings(folds=13))
     primitive = small_primitive()
     objective = ForecastObjective(primitive, TARGETS)
+    with pytest.raises(ValueError, match="horizons must be"):
+        TuningSettings(horizons=(0.5, 1.5))
+    with pytest.raises(ValueError, match="thinning must be at least 1"):
+        TuningSettings(thinning=0)
+    stranger = ebip(primitive.subset(torch.arange(23, -1, -1)))
+    with pytest.raises(ValueError, match="prior does not hold"):
+        Tuner(stranger, interactions(), primitive, objective, TARGETS, SUBSETS)
     with pytest.raises(ValueError, match="10 demonstrations, but the primitive has 24"):
         Tuner(ebip(primitive), interactions(10), primitive, objective, TARGETS, SUBSETS)

@@ -38,10 +38,19 @@ def load_checkpoint(path: str | os.PathLike[str], configuration: Mapping[str, An
     """
     try:
         stored = torch.load(path, map_location="cpu", weights_only=True)
-        version, theirs, content = stored["format"], stored["configuration"], stored["content"]
+        version, theirs, content = stored["format"], dict(stored["configuration"]), dict(stored["content"])
     except FileNotFoundError:
         raise
-    except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError, TypeError, ValueError, OSError) as error:
+    except (
+        pickle.UnpicklingError,
+        RuntimeError,
+        EOFError,
+        KeyError,
+        IndexError,
+        TypeError,
+        ValueError,
+        OSError,
+    ) as error:
         raise ValueError(
             f"{path}: not a readable checkpoint (cut off, damaged or of another kind): {error}"
         ) from error
@@ -55,4 +64,4 @@ def load_checkpoint(path: str | os.PathLike[str], configuration: Mapping[str, An
     ]
     if differing:
         raise ValueError(f"{path}: checkpoint of another configuration: {'; '.join(differing)}")
-    return dict(content)
+    return content

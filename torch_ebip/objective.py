@@ -64,7 +64,12 @@ class ForecastObjective(nn.Module):
         self.weights = Weights() if weights is None else weights
         if self.weights.tool and (arm is None or arm_dofs is None):
             raise ValueError("the tool term needs an arm and the DoFs that are its joints")
-        scale = primitive.end_variance.sqrt()[targets]
+        ends = primitive.end_variance
+        fixed = targets & ~(ends > 1e-8 * primitive.residual_variance)
+        if not bool(targets.any()) or bool(fixed.any()):
+            names = [dof for dof, still in zip(primitive.layout.dofs, fixed.tolist(), strict=True) if still]
+            raise ValueError(f"targets must be DoFs that end differently in different demonstrations, got {names}")
+        scale = ends.sqrt()[targets]
         self.crps = CRPSLoss(scale)
         self.squared_error = TrajectoryLoss(scale)
         self.innovation = InnovationLikelihoodLoss()

@@ -32,7 +32,7 @@ class InteractionPrimitive(nn.Module):
         residual_variance: [D], the paper's closed-form R (Section IV): the mean over demonstrations of each
             one's mean squared residual, in squared units of the DoF.
         residual_correlation_time: [D], integrated autocorrelation time of those residuals, in samples.
-        value_variance: [D], variance of each DoF over all measured samples, squared units.
+        value_variance: [D], variance of each DoF over all measured samples, squared units; 0 for a constant.
         end_variance: [D], variance over demonstrations of h(1, w), squared units.
     """
 
@@ -149,4 +149,6 @@ def _measured_variance(samples: Samples) -> Tensor:
     values = torch.where(samples.observed, samples.values, 0)
     mean = values.sum((0, 1)) / count
     deviation = torch.where(samples.observed, samples.values - mean, 0)
-    return deviation.square().sum((0, 1)) / count
+    variance = deviation.square().sum((0, 1)) / count
+    # What a constant leaves by rounding is not a scale to measure anything by.
+    return torch.where(variance > 1e-12 * mean.square(), variance, 0)

@@ -51,13 +51,14 @@ def write_npz(path: str | os.PathLike[str], recordings: Recordings) -> None:
         "controlled": layout.controlled.numpy(),
     }
     for name, column in recordings.columns.items():
-        if name in arrays:
+        if name in arrays or name == "file":
             raise ValueError(f"column {name!r} has the name of a part of the format; rename it")
         if column.dtype.hasobject:
             raise ValueError(f"column {name!r} holds Python objects; only numbers and strings can be saved")
         arrays[name] = column
+    # Nothing is pickled: columns of objects were refused above.
     with atomic_write(path) as file:
-        np.savez_compressed(file, allow_pickle=False, **arrays)
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
 
 def read_npz(path: str | os.PathLike[str]) -> Recordings:
@@ -108,21 +109,25 @@ def _from_arrays(path: str | os.PathLike[str], arrays: Mapping[str, Array]) -> R
                 f"{len(lengths)} demonstrations"
             )
     trajectories = np.split(values, np.cumsum(lengths)[:-1]) if len(lengths) else []
-    return Recordings(_layout(path, arrays), list(trajectories), float(rate), columns)
+    try:
+        layout = _layout(arrays)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    return Recordings(layout, list(trajectories), float(rate), columns)
 
 
-def _layout(path: str | os.PathLike[str], arrays: Mapping[str, Array]) -> Layout:
+def _layout(arrays: Mapping[str, Array]) -> Layout:
     modality = [str(name) for name in arrays["modality"]]
     modalities = []
     for name in dict.fromkeys(modality):
         columns = [i for i, other in enumerate(modality) if other == name]
         if columns != list(range(columns[0], columns[-1] + 1)):
-            raise ValueError(f"{path}: the columns of modality {name!r} are not side by side: {columns}")
+            raise ValueError(f"the columns of modality {name!r} are not side by side: {columns}")
         units = {str(arrays["unit"][i]) for i in columns}
         controlled = {bool(arrays["controlled"][i]) for i in columns}
         if len(units) != 1 or len(controlled) != 1:
             raise ValueError(
-                f"{path}: modality {name!r} must have one unit and one controller, got units "
+                f"modality {name!r} must have one unit and one controller, got units "
                 f"{sorted(units)}, controlled {sorted(controlled)}"
             )
         dofs = [str(arrays["dofs"][i]) for i in columns]

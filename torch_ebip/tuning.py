@@ -69,6 +69,17 @@ class TuningSettings:
     only: tuple[str, ...] = ("*",)
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        """ValueError for a setting outside its range."""
+        for name in ("steps", "batch_size", "horizons_each", "validate_every", "patience", "thinning"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        low, high = self.horizons
+        if not 0 < low <= high <= 1:
+            raise ValueError(f"horizons must be 0 < low <= high <= 1, got {self.horizons}")
+        if not 0 < self.validation < 1:
+            raise ValueError(f"validation must be a share between 0 and 1, got {self.validation}")
+
 
 class TuningResult(NamedTuple):
     """How a tuning went: the step whose parameters were kept, validation loss by step, why it ended."""
@@ -114,14 +125,19 @@ class Tuner:
     ) -> None:
         if len(primitive) != len(demonstrations):
             raise ValueError(f"{len(demonstrations)} demonstrations, but the primitive has {len(primitive)}")
+        states = getattr(filter.prior, "states", None)
+        if states is None or not torch.equal(states[:, 2:], primitive.weights):
+            raise ValueError("the filter's prior does not hold the demonstrations of this primitive")
         self.filter, self.primitive, self.objective = filter, primitive, objective
         self.settings = TuningSettings() if settings is None else settings
-        self.targets, self.subsets = targets, dict(subsets)
+        device = primitive.weights.device
+        self.targets = targets.to(device)
+        self.subsets = {name: subset.to(device) for name, subset in subsets.items()}
         self.monitor, self.progress = monitor, progress
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         self.layout = demonstrations.layout
         self.values, self.observed = demonstrations.pad()
-        self.lengths = demonstrations.lengths
+        self.lengths = demonstrations.lengths.to(device)
         self.parameters = {
             name: parameter
             for name, parameter in filter.named_parameters()
@@ -188,15 +204,18 @@ class Tuner:
     ) -> tuple[EnsembleFilter, Trace, tuple[Any, ...]]:
         """Filter some interactions [B], shown a subset [D] of sensors, up to shares [B, K] of their length."""
         kept_dofs = subset | self.targets
-        stride = self.settings.thinning
+        stride, device = self.settings.thinning, self.lengths.device
+        members = self._members(interactions, generator).to(device)
+        interactions, shares = interactions.to(device), shares.to(device)
         part = restrict(self.filter, kept_dofs, stride)
         last = (self.lengths[interactions] - 1).unsqueeze(-1)
-        steps = (shares * last / stride).round().long()
+        steps = torch.minimum((shares * last / stride).round().long(), last // stride)
         length = int(steps.max()) + 1
         y = self.values[interactions, ::stride][:, :length][..., kept_dofs]
         observed = self.observed[interactions, ::stride][:, :length][..., kept_dofs] & subset[kept_dofs]
-        observed = observed & (torch.arange(length).view(1, -1, 1) <= steps.amax(-1).view(-1, 1, 1))
-        state = part.initial_state((len(interactions),), self._members(interactions, generator), generator)
+        within = torch.arange(length, device=steps.device).view(1, -1, 1) <= steps.amax(-1).view(-1, 1, 1)
+        observed = observed & within
+        state = part.initial_state((len(interactions),), members, generator)
         segment = self.settings.segment if torch.is_grad_enabled() else None
         trace = part(
             y, observed, state=state, generator=generator, keep=steps, segment=segment or None, project=False
@@ -287,7 +306,17 @@ class Tuner:
         settings = {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(self.settings).items()}
         shapes: Sequence[str] = [f"{name} {list(p.shape)}" for name, p in self.parameters.items()]
         interactions = int(self.lengths.sum())
-        return {**settings, "parameters": list(shapes), "samples": interactions, "subsets": list(self.subsets)}
+        masks = {name: mask.tolist() for name, mask in {**self.subsets, "targets": self.targets}.items()}
+        return {
+            **settings,
+            "parameters": list(shapes),
+            "samples": interactions,
+            "masks": masks,
+            "square_root": self.filter.square_root,
+            "objective_weights": list(self.objective.weights),
+            "filter_buffers": _fingerprint(self.filter),
+            "objective_buffers": _fingerprint(self.objective),
+        }
 
     def _snapshot(self) -> dict[str, Tensor]:
         return {name: parameter.detach().clone() for name, parameter in self.parameters.items()}
@@ -316,6 +345,11 @@ class Tuner:
         self._restore(content["parameters"])
         optimizer.load_state_dict(content["optimizer"])
         return content["step"], content["best"], content["validation"]
+
+
+def _fingerprint(module: nn.Module) -> dict[str, str]:
+    """The norm of every buffer to four digits: starting points, prior states, scales; blind to rounding."""
+    return {name: f"{float(buffer.double().norm()):.4g}" for name, buffer in module.named_buffers()}
 
 
 def _waited(history: Mapping[int, float]) -> int:

@@ -10,6 +10,7 @@ from experiments.ball_catching.dataset import load_or_generate
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
+    """Run from the command line."""
     parser = argparse.ArgumentParser(prog="python -m experiments.ball_catching", description=__doc__)
     parser.add_argument("--n", type=int, default=221, help="number of demonstrations (default: 221, as in the paper)")
     parser.add_argument("--seed", type=int, default=0)

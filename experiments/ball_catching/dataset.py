@@ -6,6 +6,7 @@ import hashlib
 import os
 import warnings
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -132,4 +133,6 @@ def _digest() -> str:
     digest = hashlib.sha256()
     for name in names:
         digest.update((here / f"{name}.py").read_bytes())
+    for name in ("arm.py", "ur5.urdf"):
+        digest.update(resources.files("torch_ebip.kinematics").joinpath(name).read_bytes())
     return digest.hexdigest()[:12]

@@ -35,11 +35,20 @@ def test_a_finished_run_stops_unless_forced(tmp_path: Path) -> None:
     assert not again.results.exists()
 
 
+def test_numbers_that_are_not_finite_become_null(tmp_path: Path) -> None:
+    write_json(tmp_path / "a.json", {"a": [float("nan"), 1.0], "b": (float("inf"),)})
+    assert json.loads((tmp_path / "a.json").read_text()) == {"a": [None, 1.0], "b": [None]}
+
+
 def test_other_files_are_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("mine")
     for force in (False, True):
         with pytest.raises(SystemExit, match="holds files but no run"):
             RunFolder("tune", {}, str(tmp_path), force=force)
+    for foreign in ('{"model_type": "llama"}', '{"experiment"', "[]"):
+        (tmp_path / "config.json").write_text(foreign)
+        with pytest.raises(SystemExit, match="holds files but no run"):
+            RunFolder("tune", {}, str(tmp_path), force=True)
     with pytest.raises(SystemExit, match="is a file"):
         RunFolder("tune", {}, str(tmp_path / "thesis.tex"))
     with pytest.raises(SystemExit, match="cannot be written"):

@@ -11,12 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from experiments import tune
 from experiments.evaluate import FilterMethod, MeanMethod, NearestMethod, Task, evaluate
-from experiments.methods import scaled
+from experiments.methods import Problem, best_factor, scaled, tunable
 from tests.conftest import interactions, small_primitive
-from torch_ebip import Demonstrations, Layout, Modality
+from torch_ebip import BSplineBasis, Demonstrations, InteractionPrimitive, Layout, Modality, select_basis
 
 SMALL = ["--steps", "3", "--quick", "--seed", "5"]
 
@@ -60,18 +61,18 @@ def test_two_runs_of_a_seed_agree(finished: Path, recordings: str, tmp_path: Pat
 
 
 def test_a_killed_run_resumes_to_the_same_table(recordings: str, tmp_path: Path) -> None:
-    """Three folds in processes of their own; killed after the first finished one."""
-    arguments = ["--data", recordings, *SMALL, "--folds", "3", "--workers", "1", "--out"]
+    """Three folds in processes of their own; killed while the second is tuning, with its checkpoint written."""
+    arguments = ["--data", recordings, "--quick", "--steps", "20", "--folds", "3", "--workers", "1", "--out"]
     command = [sys.executable, "-m", "experiments.tune", *arguments]
     root = Path(tune.__file__).parents[1]
     run = tmp_path / "killed"
     started = subprocess.Popen([*command, str(run)], cwd=root, start_new_session=True, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 120
-    while not (run / "fold-00" / "values.json").exists() and time.monotonic() < deadline:
-        time.sleep(0.05)
+    while not (run / "fold-01" / "checkpoint.pt").exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
     os.killpg(started.pid, signal.SIGKILL)
     started.wait()
-    assert not (run / "results.json").exists()
+    assert not (run / "fold-01" / "values.json").exists()
     kept = (run / "fold-00" / "values.json").stat().st_mtime_ns
     subprocess.run([*command, str(run)], cwd=root, check=True, capture_output=True)
     assert (run / "fold-00" / "values.json").stat().st_mtime_ns == kept
@@ -125,12 +126,79 @@ def test_nearest_finds_the_same_interaction() -> None:
     assert np.median(mae["mean"]) > 0.2
 
 
+def test_the_best_factor_does_not_wander_when_asked_again(tmp_path: Path) -> None:
+    primitive, made = small_primitive(), interactions()
+    subsets = {"all": torch.tensor([True, True, True, False, False])}
+    problem = Problem(made, primitive, ~subsets["all"], subsets, None)
+    settings = tune.TuningSettings(folds=4, thinning=2)
+    answers = [best_factor(problem, scaled, settings, 8, [1.0, 10.0], tmp_path / "scan.json") for _ in range(3)]
+    assert len(set(answers)) == 1
+    losses = {float(k): v for k, v in json.loads((tmp_path / "scan.json").read_text()).items()}
+    assert len(losses) == 4
+    assert answers[0] == min(losses, key=lambda factor: losses[factor])
+
+
+def test_the_simulated_task_has_the_papers_nine_cells() -> None:
+    demonstrations, task = tune.load(None, 16, 0)
+    primitive = InteractionPrimitive.fit(
+        demonstrations.subset(range(12)), select_basis(demonstrations, [BSplineBasis(8)])
+    )
+    tests = demonstrations.subset(range(12, 16))
+    values = evaluate(task, {"ebip_tuned": FilterMethod(tunable(primitive, 100.0), 0)}, tests)
+    cells = {(cell.subset, cell.observed) for cell in values}
+    assert len(cells) == 9
+    assert ("ball", 0.43) not in cells
+    metrics = {(cell.metric, cell.modality, cell.unit) for cell in values}
+    assert {
+        ("mse", "robot", "rad^2"),
+        ("mae", "ball", "m"),
+        ("tool_error", None, "m"),
+        ("phase_error", None, "1"),
+    } <= metrics
+    # The squared error is of the first three joints, the tool's through forward kinematics.
+    cell = next(c for c in values if (c.metric, c.modality, c.subset, c.observed) == ("mse", "robot", "ball", 0.82))
+    method = FilterMethod(tunable(primitive, 100.0), 0)
+    y, measured = tests.pad()
+    steps = (tests.lengths * 0.82).round().long().unsqueeze(-1) - 1
+    both = torch.cat([(tests.lengths * 0.43).round().long().unsqueeze(-1) - 1, steps], -1)
+    length = int(steps.max()) + 1
+    shown = (
+        measured[:, :length]
+        & tests.layout.mask(["ball"])
+        & (torch.arange(length).view(1, -1, 1) <= steps.unsqueeze(-1))
+    )
+    answer = method(y[:, :length], shown, both, tests.layout.mask(task.targets))
+    robot = answer.forecast.mean[:, 1, 3:]
+    truth = torch.stack([trajectory[-1, tests.layout.slice("robot")] for trajectory in tests])
+    np.testing.assert_allclose(values[cell]["ebip_tuned"], (robot - truth)[:, :3].square().mean(-1), rtol=1e-4)
+    tool = next(c for c in values if (c.metric, c.subset, c.observed) == ("tool_error", "ball", 0.82))
+    arm = task.arm[0]
+    distance = (arm(robot)[:, :3, 3] - arm(truth)[:, :3, 3]).norm(dim=-1)
+    np.testing.assert_allclose(values[tool]["ebip_tuned"], distance, rtol=1e-4)
+
+
+def test_tuning_through_the_arm_reaches_the_noise() -> None:
+    demonstrations, task = tune.load(None, 16, 0)
+    primitive = InteractionPrimitive.fit(demonstrations, select_basis(demonstrations, [BSplineBasis(8)]))
+    layout = demonstrations.layout
+    subsets = {name: layout.mask(names) for name, names in task.subsets.items()}
+    problem = Problem(
+        demonstrations, primitive, layout.mask(task.targets), subsets, (task.arm[0], layout.mask(["robot"]))
+    )
+    filter = tunable(primitive, 100.0)
+    settings = tune.TuningSettings(steps=2, batch_size=4, validate_every=1, folds=2)
+    result = tune.tune(problem, filter, settings, None, None, None)
+    assert set(result.validation) == {0, 1, 2}
+    assert problem.objective().weights.tool == 1.0
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["--data", "nowhere.npz"], "nowhere.npz"),
         (["--folds", "31"], "--folds must be between 1 and the 30"),
         (["--folds", "0"], "--folds must be between"),
+        (["--demonstrations", "0"], "--demonstrations must be at least 1"),
     ],
 )
 def test_bad_arguments_are_named(arguments: list[str], message: str, recordings: str, tmp_path: Path) -> None:
@@ -138,6 +206,14 @@ def test_bad_arguments_are_named(arguments: list[str], message: str, recordings:
     with pytest.raises(SystemExit, match=message):
         tune.main([*base, *arguments, "--out", str(tmp_path / "run")])
     assert not (tmp_path / "run").exists()
+
+
+def test_too_few_recordings_are_refused_before_any_work(tmp_path: Path) -> None:
+    for count in (2, 6, 11):
+        interactions(count).save(tmp_path / "few.npz")
+        with pytest.raises(SystemExit, match=f"{count} demonstrations with . held out are too few"):
+            tune.main(["--data", str(tmp_path / "few.npz"), "--out", str(tmp_path / "run")])
+        assert not (tmp_path / "run").exists()
 
 
 def test_recordings_without_a_controlled_modality_are_refused(tmp_path: Path) -> None:

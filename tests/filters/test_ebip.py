@@ -6,7 +6,7 @@ import torch
 
 from tests.conftest import interactions, small_primitive
 from tests.filters.contract import FilterContract
-from torch_ebip import BSplineBasis, EnsembleFilter, ebip
+from torch_ebip import BSplineBasis, Demonstrations, EnsembleFilter, InteractionPrimitive, ebip
 from torch_ebip.filters.ebip import restrict
 from torch_ebip.noise import AboveOne, Positive
 
@@ -114,7 +114,7 @@ def test_members_are_demonstrations() -> None:
 
 def test_bad_members_are_named() -> None:
     made = ebip(small_primitive())
-    with pytest.raises(ValueError, match="names demonstration 24; the prior has 24"):
+    with pytest.raises(ValueError, match="must name demonstrations 0 to 23, got 0 to 24"):
         made.initial_state(members=torch.tensor([0, 24]))
     with pytest.raises(ValueError, match="must be int64"):
         made.initial_state(members=torch.tensor([0.0, 1.0]))
@@ -128,8 +128,6 @@ def test_leaving_out_dofs_that_nobody_asks_for_is_exact() -> None:
     whole = ebip(
         primitive, context=BSplineBasis(4), localise=True, inflation=AboveOne(one), square_root=True, weigh=True
     )
-    silent(whole)
-    whole.noise.process = ebip(primitive).noise.process
     y, observed = interactions(2, seed=3, dtype=torch.float64).pad()
     y, observed = y[:, :20], observed[:, :20] & torch.tensor([True, False, True, False, False])
     dofs = torch.tensor([True, False, True, False, True])
@@ -144,18 +142,43 @@ def test_leaving_out_dofs_that_nobody_asks_for_is_exact() -> None:
 def test_thinning_stands_for_the_samples_left_out() -> None:
     """For slow signals every fourth sample with a quarter of R gives nearly what all of them give."""
     primitive = small_primitive(torch.float64)
-    made = silent(ebip(primitive, residual_variance=1000 * primitive.residual_variance, square_root=True))
-    made.noise.process = ebip(primitive).noise.process
+    made = ebip(primitive, residual_variance=1000 * primitive.residual_variance, square_root=True)
     y, observed = interactions(3, seed=3, dtype=torch.float64).pad()
     y, observed = y[:, :29], observed[:, :29] & torch.tensor([True, True, True, False, False])
     every = torch.ones(5, dtype=torch.bool)
-    full = made.forecast(made(y, observed).state, torch.ones(1))
+    full = made.forecast(made(y, observed, generator=torch.Generator().manual_seed(0)).state, torch.ones(1))
     thin = restrict(made, every, 4)
     assert thin.dt == pytest.approx(4 * made.dt)
-    sparse = thin.forecast(thin(y[:, ::4], observed[:, ::4]).state, torch.ones(1))
+    trace = thin(y[:, ::4], observed[:, ::4], generator=torch.Generator().manual_seed(0))
+    sparse = thin.forecast(trace.state, torch.ones(1))
     prior = made.forecast(made.initial_state((3,)), torch.ones(1))
     assert (full.mean - sparse.mean).abs().max() < 0.2 * (full.mean - prior.mean).abs().max()
     torch.testing.assert_close(full.variance, sparse.variance, rtol=0.2, atol=0)
+
+
+def test_restricting_twice_is_restricting_once() -> None:
+    primitive = small_primitive(torch.float64)
+    whole = ebip(primitive, square_root=True, weigh=True, context=BSplineBasis(4), weight_noise=0.1)
+    y, observed = interactions(2, seed=3, dtype=torch.float64).pad()
+    y, observed = y[:, :20:4], observed[:, :20:4]
+    first, last = torch.tensor([False, True, True, False, True]), torch.tensor([False, False, True, False, True])
+    once, twice = restrict(whole, last, 4), restrict(restrict(whole, first, 2), last[first], 2)
+    assert twice.thinning == once.thinning == 4
+    assert twice.dt == pytest.approx(once.dt)
+    a, b = (f(y[..., last], observed[..., last], generator=torch.Generator().manual_seed(0)) for f in (once, twice))
+    torch.testing.assert_close(a.projection, b.projection)
+    torch.testing.assert_close(a.state.weights, b.state.weights)
+
+
+def test_a_dof_that_never_moved_is_no_evidence() -> None:
+    made = interactions(8)
+    still = [torch.cat([t[:, :2], torch.full_like(t[:, :1], 1.3), t[:, 3:]], -1) for t in made]
+    primitive = InteractionPrimitive.fit(Demonstrations(made.layout, still, 30.0), small_primitive().basis)
+    assert primitive.value_variance[2] == 0
+    filter = ebip(primitive, square_root=True, weigh=True)
+    state, _ = filter.update(filter.initial_state(), torch.tensor([0.1, 0.9, 1.4, 0.0, 0.0]))
+    assert state.weights.isfinite().all()
+    assert state.mean.isfinite().all()
 
 
 def test_evidence_favours_the_demonstration_that_is_repeated() -> None:

@@ -30,10 +30,6 @@ class Samples(NamedTuple):
     observed: Tensor
     weight: Tensor
 
-    def columns(self, part: slice) -> Samples:
-        """The same for some DoFs."""
-        return Samples(self.phase, self.values[..., part], self.observed[..., part], self.weight[..., part])
-
 
 def samples_of(demonstrations: Demonstrations) -> Samples:
     """Pad, fill the gaps and weigh. Raises ValueError for a DoF that no demonstration measured."""

@@ -58,19 +58,25 @@ def default_candidates(sizes: Sequence[int] = (6, 8, 10, 12, 15)) -> list[Basis]
     return candidates
 
 
-def select_basis(demonstrations: Demonstrations, candidates: Sequence[Basis] | None = None) -> StackedBasis:
+def select_basis(
+    demonstrations: Demonstrations,
+    candidates: Sequence[Basis] | None = None,
+    *,
+    ranking: Sequence[CandidateFit] | None = None,
+) -> StackedBasis:
     """For each modality the candidate with the smallest BIC; `rank_candidates` gives the table behind it.
 
     Args:
         demonstrations: all of them count.
         candidates: default `default_candidates()`; those with more functions than the shortest demonstration
             has samples are left out.
+        ranking: what `rank_candidates` said of these demonstrations, if it is known already.
 
     Raises:
         ValueError: no candidate is small enough, or a DoF was never measured.
     """
     best: dict[str, CandidateFit] = {}
-    for row in rank_candidates(demonstrations, candidates):
+    for row in rank_candidates(demonstrations, candidates) if ranking is None else ranking:
         best.setdefault(row.modality, row)
     layout = demonstrations.layout
     return StackedBasis([best[modality.name].basis for modality in layout.modalities for _ in modality.dofs])

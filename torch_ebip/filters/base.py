@@ -176,7 +176,9 @@ class Filter(nn.Module, ABC):
             state = self.initial_state(batch, generator=generator)
         elif state[0].shape[: len(batch)] != batch:
             raise ValueError(f"the state's batch does not begin with {list(batch)}: {list(state[0].shape)}")
-        if keep is not None and (keep.shape[:-1] != batch or int(keep.min()) < 0 or int(keep.max()) >= length):
+        if keep is not None and (
+            keep.shape[:-1] != batch or keep.numel() == 0 or int(keep.min()) < 0 or int(keep.max()) >= length
+        ):
             raise ValueError(f"keep must be [{', '.join(map(str, batch))}, K] with steps 0..{length - 1}, got {keep}")
         step = torch.as_tensor(self.dt if dt is None else dt).to(state[0])
 

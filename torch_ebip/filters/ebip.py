@@ -113,26 +113,26 @@ def restrict(whole: EnsembleFilter, dofs: Tensor, thinning: int = 1) -> Ensemble
         raise TypeError("only filters made by ebip can be restricted to some DoFs")
     if not isinstance(prior, DemonstrationPrior):
         raise TypeError("only a prior of demonstrations can be restricted to some DoFs")
+    dofs = dofs.to(prior.states.device)
     index = dofs.nonzero().squeeze(-1)
-    of_weight = observation.basis.dof_of_weight().to(dofs.device)
-    weights = dofs[of_weight].nonzero().squeeze(-1).to(prior.states.device)
+    weights = dofs[observation.basis.dof_of_weight().to(dofs.device)].nonzero().squeeze(-1)
     state = torch.cat([torch.arange(2, device=weights.device), weights + 2])
     localisation = whole.localisation
     names = whole.dof_names
     part = EnsembleFilter(
         whole.dynamics,
-        BasisProjection(observation.basis.select(dofs)),
-        FilterNoise(process.select(weights), SelectedNoise(whole.noise.measurement, index.to(weights.device))),
+        BasisProjection(observation.basis.select(dofs.cpu())),
+        FilterNoise(process.select(weights, thinning), SelectedNoise(whole.noise.measurement, index)),
         prior.select(state),
         whole.n_members,
         len(index),
         whole.dt * thinning,
         whole.square_root,
         whole.inflation,
-        None if localisation is None else localisation.select(state, index.to(weights.device)),
+        None if localisation is None else localisation.select(state, index),
         whole.weighting,
-        thinning,
+        thinning * whole.thinning,
+        index if whole.columns is None else whole.columns[index],
         None if names is None else tuple(names[i] for i in index.tolist()),
     )
-    part.columns = index.to(weights.device)
     return part.train(whole.training)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_ebip import functional
+from torch_ebip.draws import standard_normal
 from torch_ebip.filters.base import Filter, Forecast
 from torch_ebip.filters.evidence import Evidence, EvidenceWeighting
 from torch_ebip.filters.interaction import BasisProjection
@@ -78,11 +79,14 @@ class EnsembleFilter(Filter):
             Needs a state of phase, phase velocity and weights.
         thinning: how many samples each one given stands for: R is divided by it and inflation raised to its
             power. For sequences of which only every k-th sample is used.
+        columns: int64 [D], which of the weighting's DoFs this filter has; default: all of them.
         dof_names: for error messages.
 
     Raises:
-        ValueError: fewer than two members.
+        ValueError: fewer than two members, or weighting without a basis projection.
     """
+
+    columns: Tensor | None
 
     def __init__(
         self,
@@ -98,6 +102,7 @@ class EnsembleFilter(Filter):
         localisation: Localisation | None = None,
         weighting: EvidenceWeighting | None = None,
         thinning: int = 1,
+        columns: Tensor | None = None,
         dof_names: tuple[str, ...] | None = None,
     ) -> None:
         super().__init__(dt, n_dofs)
@@ -113,7 +118,9 @@ class EnsembleFilter(Filter):
         self.localisation = localisation
         self.weighting = weighting
         self.thinning = thinning
-        self.columns: Tensor | None = None
+        if weighting is not None and not isinstance(observation, BasisProjection):
+            raise ValueError("evidence weights need demonstrations behind the members, and so a BasisProjection")
+        self.register_buffer("columns", columns)
         self.dof_names = dof_names
 
     def initial_state(
@@ -156,9 +163,7 @@ class EnsembleFilter(Filter):
                     members, projections, y, factor, observed, taper, weights
                 )
             else:
-                draws = torch.randn(
-                    projections.shape, generator=generator, dtype=members.dtype, device=members.device
-                )
+                draws = standard_normal(projections.shape, members, generator)
                 updated, likelihood = functional.ensemble_update(
                     members, projections, y, factor, draws, observed, taper, weights
                 )

@@ -102,7 +102,8 @@ class EvidenceWeighting(nn.Module):
         """
         variance = self.variance if columns is None else self.variance[columns]
         modality = self.modality_of_dof if columns is None else self.modality_of_dof[columns]
-        scale = self.factor.value[modality] / variance
+        # A DoF that never moved in the demonstrations says nothing about which of them this is.
+        scale = torch.where(variance > 0, self.factor.value[modality] / torch.where(variance > 0, variance, 1), 0)
         scale = torch.where(observed, scale, 0) / observed.sum(-1, keepdim=True).clamp(min=1)
         difference = projections - torch.where(observed, y, 0).unsqueeze(-2)
         distance = (difference.square() @ scale.unsqueeze(-1)).squeeze(-1)

@@ -19,7 +19,8 @@ class ConstantVelocityPhase(nn.Module):
     Outside [0, 1] the paper says nothing. An interaction that is over stays at its end: there the excess e
     becomes e / (1 + |e| / overrun), which is e near the interval and never more than ``overrun``. So members
     that ran past the end while sensors were blind wait close to it, keep their gradients and their response
-    to measurements, and can be called back.
+    to measurements, and can be called back. This acts once in each prediction, so where exactly they wait
+    depends a little on the rate of predictions.
 
     Args:
         overrun: how far beyond the interval a phase can get.

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from torch_ebip.draws import standard_normal
+
 
 class DemonstrationPrior(nn.Module):
     """The demonstrations themselves: the paper's eBIP, step 1 of its algorithm.
@@ -45,11 +47,14 @@ class DemonstrationPrior(nn.Module):
             if n_members == count:
                 return self.states.expand(*batch_shape, -1, -1)
             shape = (*batch_shape, n_members)
-            members = torch.randint(count, shape, generator=generator, device=self.states.device)
+            device = self.states.device if generator is None else generator.device
+            members = torch.randint(count, shape, generator=generator, device=device).to(self.states.device)
         if members.dtype != torch.int64 or members.ndim < 1:
             raise ValueError(f"members must be int64 [..., E], got {members.dtype} {tuple(members.shape)}")
         if members.numel() and (int(members.min()) < 0 or int(members.max()) >= count):
-            raise ValueError(f"members names demonstration {int(members.max())}; the prior has {count}")
+            raise ValueError(
+                f"members must name demonstrations 0 to {count - 1}, got {int(members.min())} to {int(members.max())}"
+            )
         return self.states[members.expand(*batch_shape, members.shape[-1]) if batch_shape else members]
 
     def select(self, columns: Tensor) -> DemonstrationPrior:
@@ -79,5 +84,4 @@ class GaussianPrior(nn.Module):
         if members is not None:
             raise ValueError("a Gaussian prior has no demonstrations to choose members from")
         shape = (*batch_shape, n_members, len(self.mean))
-        draws = torch.randn(shape, generator=generator, dtype=self.mean.dtype, device=self.mean.device)
-        return self.mean + draws @ self.cholesky.T
+        return self.mean + standard_normal(shape, self.mean, generator) @ self.cholesky.T

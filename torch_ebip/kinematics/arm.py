@@ -56,6 +56,7 @@ class RobotArm(nn.Module):
 
     @property
     def n_joints(self) -> int:
+        """How many joints move."""
         return len(self.joint_names)
 
     @property
@@ -94,6 +95,7 @@ class RobotArm(nn.Module):
         return pose.reshape(*joints.shape[:-1], 4, 4)
 
     def extra_repr(self) -> str:
+        """Sizes."""
         return f"n_joints={self.n_joints}"
 
     def _chain(self, dtype: torch.dtype, device: torch.device) -> Any:

@@ -1,6 +1,6 @@
 """Learnable process and measurement noise: constrained parameters that start at the closed form."""
 
-from torch_ebip.noise.constraints import AboveOne, Constrained, Positive, UnitInterval
+from torch_ebip.noise.constraints import AboveOne, Constrained, Positive
 from torch_ebip.noise.measurement import MeasurementNoise
 from torch_ebip.noise.process import InteractionNoise, NoProcessNoise, PhaseNoise, WeightNoise
 
@@ -12,6 +12,5 @@ __all__ = [
     "NoProcessNoise",
     "PhaseNoise",
     "Positive",
-    "UnitInterval",
     "WeightNoise",
 ]

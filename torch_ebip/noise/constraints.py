@@ -66,20 +66,6 @@ class Positive(Constrained):
         return self.start * (self.floor + (1 - self.floor) * self.raw.exp())
 
 
-class UnitInterval(Constrained):
-    """A factor strictly between 0 and 1: sigmoid(logit(start) + raw)."""
-
-    @staticmethod
-    def _check(start: Tensor) -> None:
-        if not bool(((start > 0) & (start < 1)).all()):
-            raise ValueError(f"a factor must start strictly between 0 and 1, got {start}")
-
-    @property
-    def value(self) -> Tensor:
-        """Factors in (0, 1), shape of `start`."""
-        return torch.sigmoid(torch.logit(self.start) + self.raw)
-
-
 class AboveOne(Constrained):
     """A factor above 1, such as an inflation: 1 + (start - 1) exp(raw)."""
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
+from torch_ebip.draws import standard_normal
 from torch_ebip.noise.constraints import Positive
 
 
@@ -77,34 +80,43 @@ class WeightNoise(nn.Module):
 class InteractionNoise(nn.Module):
     """Process noise of a state (phase, phase velocity, weights).
 
+    White accelerations that last k steps of dt as one would move the velocity k times as far (in variance) as k
+    of them; ``thinning`` takes that back, so that a step that stands for k has the noise of k steps.
+
     Args:
         phase: noise of the first two entries.
         weights: noise of the others; default none, so that members stay in the span of the demonstrations.
         columns: int64, which entries of ``weights`` the state holds; default all of them.
+        thinning: how many steps each one stands for.
     """
 
     columns: Tensor | None
 
-    def __init__(self, phase: PhaseNoise, weights: WeightNoise | None = None, columns: Tensor | None = None) -> None:
+    def __init__(
+        self,
+        phase: PhaseNoise,
+        weights: WeightNoise | None = None,
+        columns: Tensor | None = None,
+        thinning: int = 1,
+    ) -> None:
         super().__init__()
+        self.thinning = thinning
         self.phase = phase
         self.weights = weights
         self.register_buffer("columns", columns)
 
-    def select(self, columns: Tensor) -> InteractionNoise:
+    def select(self, columns: Tensor, thinning: int = 1) -> InteractionNoise:
         """The same noise, with the same parameters, for a state with some of the weights, int64 [k]."""
-        return InteractionNoise(self.phase, self.weights, columns if self.columns is None else self.columns[columns])
+        columns = columns if self.columns is None else self.columns[columns]
+        return InteractionNoise(self.phase, self.weights, columns, thinning * self.thinning)
 
     def forward(self, members: Tensor, dt: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Members [..., E, n] with noise for steps dt [...] seconds added."""
         phase, weights = members.tensor_split((2,), dim=-1)
-        phase = phase + _normal_like(phase, generator) @ self.phase.cholesky(dt).transpose(-1, -2)
+        factor = self.phase.cholesky(dt).transpose(-1, -2) / math.sqrt(self.thinning)
+        phase = phase + standard_normal(phase.shape, phase, generator) @ factor
         if self.weights is not None:
             scale = self.weights.scale(dt)
             scale = scale if self.columns is None else scale[..., self.columns]
-            weights = weights + _normal_like(weights, generator) * scale.unsqueeze(-2)
+            weights = weights + standard_normal(weights.shape, weights, generator) * scale.unsqueeze(-2)
         return torch.cat([phase, weights], dim=-1)
-
-
-def _normal_like(members: Tensor, generator: torch.Generator | None) -> Tensor:
-    return torch.randn(members.shape, generator=generator, dtype=members.dtype, device=members.device)
