@@ -12,6 +12,7 @@ from torch import Tensor
 
 from experiments.run_folder import write_json
 from torch_ebip import BSplineBasis, Demonstrations, EnsembleFilter, InteractionPrimitive, ebip
+from torch_ebip.checkpoint import load_checkpoint
 from torch_ebip.kinematics import RobotArm
 from torch_ebip.losses import ForwardKinematicsLoss
 from torch_ebip.monitor import Monitor
@@ -137,3 +138,20 @@ def _tuner(
         checkpoint,
         progress,
     )
+
+
+def restore(folder: Path, primitive: InteractionPrimitive) -> EnsembleFilter:
+    """The tuned filter that `experiments.tune` left in a run (or fold) folder.
+
+    Args:
+        folder: with ``report.json`` and ``filter.pt``.
+        primitive: of the demonstrations that it was tuned on.
+
+    Raises:
+        FileNotFoundError, ValueError: the files are not there, or not what a run writes.
+    """
+    start = json.loads((folder / "report.json").read_text())["factor_start"]
+    content = load_checkpoint(folder / "filter.pt", {"start": start})
+    filter = tunable(primitive, start)
+    filter.load_state_dict(content["parameters"], strict=False)
+    return filter

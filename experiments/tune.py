@@ -144,7 +144,11 @@ def run_fold(job: Job, progress: Callable[[int, float, float], None] | None = No
         "tuning_seconds": result.seconds,
     }
     write_json(folder / "report.json", report)
-    save_checkpoint(folder / "filter.pt", {"start": start}, {"parameters": dict(tuned.named_parameters())})
+    save_checkpoint(
+        folder / "filter.pt",
+        {"start": start},
+        {"parameters": {name: p.detach() for name, p in tuned.named_parameters()}},
+    )
     _write_values(finished, answers)
     return answers
 

@@ -15,7 +15,7 @@ import torch
 
 from experiments import tune
 from experiments.evaluate import FilterMethod, MeanMethod, NearestMethod, Task, evaluate
-from experiments.methods import Problem, best_factor, scaled, tunable
+from experiments.methods import Problem, best_factor, restore, scaled, tunable
 from tests.conftest import interactions, small_primitive
 from torch_ebip import BSplineBasis, Demonstrations, InteractionPrimitive, Layout, Modality, select_basis
 
@@ -52,6 +52,22 @@ def test_a_run_folder_is_complete(finished: Path) -> None:
 def test_a_finished_run_stops(finished: Path, recordings: str) -> None:
     with pytest.raises(SystemExit, match="finished run"):
         tune.main(["--data", recordings, *SMALL, "--out", str(finished)])
+
+
+def test_the_tuned_filter_can_be_restored(finished: Path, recordings: str) -> None:
+    demonstrations = Demonstrations.load(recordings)
+    job = tune.Job(0, 1, recordings, 0, 5, 0.2, 4, 1, "", tune.TuningSettings())
+    training, testing = tune.split(job, 30)
+    primitive = InteractionPrimitive.fit(demonstrations.subset(training))
+    method = FilterMethod(restore(finished, primitive), 5)
+    task = Task({"all": ["hand", "gaze"]}, (0.43, 0.82), [], ["arm"], {}, None)
+    values = evaluate(task, {"ebip_tuned": method}, demonstrations.subset(testing))
+    rows = json.loads((finished / "results.json").read_text())["rows"]
+    for cell, methods in values.items():
+        row = next(
+            r for r in rows if (r["method"], r["metric"], r["observed"]) == ("ebip_tuned", cell.metric, cell.observed)
+        )
+        assert methods["ebip_tuned"].mean() == pytest.approx(row["mean"], rel=1e-3), cell
 
 
 def test_two_runs_of_a_seed_agree(finished: Path, recordings: str, tmp_path: Path) -> None:

@@ -11,10 +11,10 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -27,67 +27,7 @@ from torch_ebip.filters.ensemble import EnsembleFilter
 from torch_ebip.monitor import Monitor
 from torch_ebip.objective import ForecastObjective
 from torch_ebip.primitive import InteractionPrimitive
-
-
-@dataclass(frozen=True)
-class TuningSettings:
-    """How to tune.
-
-    Attributes:
-        steps: gradient steps at most.
-        batch_size: interactions a step.
-        learning_rate: of Adam, on the logarithmic scale of all parameters; it falls along a half cosine.
-        horizons: smallest and largest share of an interaction that is shown.
-        horizons_each: horizons for each interaction of a batch.
-        folds: into how many parts the demonstrations are cut: an interaction's ensemble is the other parts.
-        n_members: E while tuning; default: all demonstrations of the other parts.
-        pull: weight of the mean squared distance from the starting point, per parameter group.
-        clip: largest norm of the gradient.
-        validation: share of the demonstrations that are kept for early stopping.
-        validate_every: steps between validations.
-        patience: validations without improvement before stopping.
-        thinning: use every k-th sample while tuning, each standing for k (see `EnsembleFilter`): k times faster.
-        segment: samples a segment of gradient checkpointing (exact); 0 for none.
-        only: shell patterns of the names of the parameters to tune.
-        seed: of everything random.
-    """
-
-    steps: int = 100
-    batch_size: int = 16
-    learning_rate: float = 0.1
-    horizons: tuple[float, float] = (0.2, 0.95)
-    horizons_each: int = 3
-    folds: int = 5
-    n_members: int | None = None
-    pull: float = 0.01
-    clip: float = 1.0
-    validation: float = 0.2
-    validate_every: int = 20
-    patience: int = 5
-    thinning: int = 4
-    segment: int = 0
-    only: tuple[str, ...] = ("*",)
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        """ValueError for a setting outside its range."""
-        for name in ("steps", "batch_size", "horizons_each", "validate_every", "patience", "thinning"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        low, high = self.horizons
-        if not 0 < low <= high <= 1:
-            raise ValueError(f"horizons must be 0 < low <= high <= 1, got {self.horizons}")
-        if not 0 < self.validation < 1:
-            raise ValueError(f"validation must be a share between 0 and 1, got {self.validation}")
-
-
-class TuningResult(NamedTuple):
-    """How a tuning went: the step whose parameters were kept, validation loss by step, why it ended."""
-
-    best_step: int
-    validation: dict[int, float]
-    stopped_early: bool
-    seconds: float
+from torch_ebip.tuning.settings import TuningResult, TuningSettings
 
 
 class Tuner:
