@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
-import torch
 from torch import Tensor, nn
 
 
@@ -59,26 +58,3 @@ class Basis(nn.Module, ABC):
 def _split(phase: Tensor) -> tuple[Tensor, Tensor]:
     inside = phase.clamp(0, 1)
     return inside, phase - inside
-
-
-def spaced_centres(count: int) -> Tensor:
-    """[count] centres from 0 to 1 (0.5 for a single one), float64."""
-    if count == 1:
-        return torch.tensor([0.5], dtype=torch.float64)
-    return torch.linspace(0, 1, count, dtype=torch.float64)
-
-
-def checked_width(name: str, count: int, width: float | None) -> float:
-    """The given width, or the spacing of the centres; ValueError unless it is positive."""
-    width = 1 / max(count - 1, 1) if width is None else float(width)
-    if not 0 < width < float("inf"):
-        raise ValueError(f"{name}: width must be a positive phase, got {width}")
-    return width
-
-
-def with_offset(values: Tensor, slopes: Tensor, offset: bool) -> tuple[Tensor, Tensor]:
-    """Append the constant function, for families that cannot represent one."""
-    if not offset:
-        return values, slopes
-    one = torch.ones_like(values[..., :1])
-    return torch.cat([values, one], dim=-1), torch.cat([slopes, torch.zeros_like(one)], dim=-1)

@@ -183,6 +183,7 @@ class Filter(nn.Module, ABC):
         step = torch.as_tensor(self.dt if dt is None else dt).to(state[0])
 
         def run(state: State, start: int, stop: int, generator: torch.Generator | None) -> _Segment:
+            """Samples start to stop - 1."""
             record = _Segment(state, [], [], [], [])
             for t in range(start, stop):
                 if t > 0:
@@ -247,6 +248,7 @@ def _checkpointed(
     ends = []
 
     def replay(state: State) -> _Segment:
+        """The segment with the draws of the first time."""
         again = torch.Generator(generator.device)
         again.set_state(beginning)
         done = run(state, start, stop, again)
@@ -265,6 +267,7 @@ def _pick(state: State, here: Tensor) -> list[tuple[tuple[int, ...], State]]:
     places = [tuple(index) for index in here.nonzero().tolist()]
 
     def entry(index: tuple[int, ...], part: Tensor) -> Tensor:
+        """One entry of the batch."""
         return part[index]
 
     return [(place, map_state(partial(entry, place[:-1]), state)) for place in places]
@@ -274,6 +277,7 @@ def _assemble(picked: list[tuple[tuple[int, ...], State]], shape: torch.Size) ->
     ordered = [state for _, state in sorted(picked, key=lambda pair: pair[0])]
 
     def stack(*parts: Tensor) -> Tensor:
+        """The entries in their places, [*shape, ...]."""
         return torch.stack(parts).reshape(*shape, *parts[0].shape)
 
     return map_state(stack, *ordered)

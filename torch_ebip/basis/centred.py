@@ -1,0 +1,56 @@
+"""What Gaussians and sigmoids share: one curve, shifted to evenly spaced centres."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+import torch
+from torch import Tensor
+
+from torch_ebip.basis.base import Basis
+
+
+class CentredBasis(Basis):
+    """curve((phi - c_b) / width) with centres c_b evenly from 0 to 1, and on request a constant.
+
+    Args:
+        n_features: number of functions, the constant of `offset` included.
+        width: scale of the curve, in phase; default: `share_of_spacing` of the spacing of the centres.
+        offset: make the last of the functions a constant, which these families represent badly without.
+
+    Raises:
+        ValueError: too few functions, or a width that is not positive.
+    """
+
+    share_of_spacing = 1.0
+    centres: Tensor
+
+    def __init__(self, n_features: int, width: float | None = None, offset: bool = False) -> None:
+        super().__init__(n_features)
+        name, count = type(self).__name__, n_features - offset
+        if count < 1:
+            raise ValueError(f"{name}: n_features={n_features} leaves no function beside the offset")
+        self.offset = offset
+        self.width = self.share_of_spacing / max(count - 1, 1) if width is None else float(width)
+        if not 0 < self.width < float("inf"):
+            raise ValueError(f"{name}: width must be a positive phase, got {width}")
+        middle = torch.tensor([0.5], dtype=torch.float64)
+        centres = middle if count == 1 else torch.linspace(0, 1, count, dtype=torch.float64)
+        self.register_buffer("centres", centres, persistent=False)
+
+    @abstractmethod
+    def curve(self, distance: Tensor) -> tuple[Tensor, Tensor]:
+        """The curve and its slope, both of the shape of the distances from its centre in widths."""
+
+    def evaluate(self, phase: Tensor) -> tuple[Tensor, Tensor]:
+        """Values and slopes; see `Basis.evaluate`."""
+        values, slopes = self.curve((phase.unsqueeze(-1) - self.centres.to(phase)) / self.width)
+        slopes = slopes / self.width
+        if self.offset:
+            one = torch.ones_like(values[..., :1])
+            return torch.cat([values, one], dim=-1), torch.cat([slopes, torch.zeros_like(one)], dim=-1)
+        return values, slopes
+
+    def extra_repr(self) -> str:
+        """The settings; see `Basis.extra_repr`."""
+        return f"n_features={self.n_features}, width={self.width:.6g}, offset={self.offset}"
