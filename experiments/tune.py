@@ -299,7 +299,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--out", metavar="DIR", help="run folder (default: runs/tune/STAMP); resumes an unfinished run"
     )
-    parser.add_argument("--force", action="store_true", help="start over whatever --out holds")
+    parser.add_argument("--force", action="store_true", help="start over, also where --out holds a finished run")
     return parser
 
 
