@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from experiments.results import Cell, Values
-from torch_ebip import Demonstrations, EnsembleFilter, Forecast, InteractionPrimitive
+from torch_ebip import Demonstrations, Filter, Forecast, InteractionPrimitive
 from torch_ebip import metrics as measure
-from torch_ebip.filters.ebip import restrict
 from torch_ebip.kinematics import RobotArm
 
 
@@ -40,15 +39,11 @@ class Answer(NamedTuple):
     """What a method says of the end of B interactions at K fractions.
 
     Attributes:
-        forecast: mean and variance [B, K, D], at phase 1.
-        members: [B, K, E, D].
-        weights: of the members, [B, K, E]; None if equal.
+        forecast: of phase 1, mean and variance [B, K, D]; NaN where the method has no opinion or no variance.
         phase: [B, K], where it believes the interaction is; NaN if it has no opinion.
     """
 
     forecast: Forecast
-    members: Tensor
-    weights: Tensor | None
     phase: Tensor
 
 
@@ -62,21 +57,20 @@ class Method(Protocol):
 class FilterMethod:
     """A filter, with draws of its own seed."""
 
-    def __init__(self, filter: EnsembleFilter, seed: int) -> None:
+    def __init__(self, filter: Filter, seed: int) -> None:
         self.filter, self.seed = filter, seed
 
     @torch.no_grad()
     def __call__(self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor) -> Answer:
         """See `Method`. DoFs that are neither shown nor asked for are left out of the filter."""
         used = observed.any(0).any(0) | dofs
-        part = restrict(self.filter, used)
+        part = self.filter.restrict(used)
         generator = torch.Generator().manual_seed(self.seed)
         trace = part(y[..., used], observed[..., used], generator=generator, keep=keep, project=False)
         assert trace.kept is not None
-        members = part.forecast_members(trace.kept, y.new_ones(1))[..., 0, :, :][..., dofs[used]]
-        forecast = part.forecast(trace.kept, y.new_ones(1))
-        ends = (forecast.mean[..., 0, :][..., dofs[used]], forecast.variance[..., 0, :][..., dofs[used]])
-        return Answer(Forecast(*ends, forecast.phase), members, trace.kept.weights, part.phase(trace.kept))
+        forecast = part.forecast(trace.kept, y.new_ones(1)).select(dofs[used])
+        fields = (None if field is None else field[:, :, 0] for field in forecast[:5])
+        return Answer(Forecast(*fields, forecast.fair), part.phase(trace.kept))
 
 
 class MeanMethod:
@@ -88,8 +82,8 @@ class MeanMethod:
     def __call__(self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor) -> Answer:
         """See `Method`."""
         members = self.ends[:, dofs].expand(*keep.shape, -1, -1)
-        forecast = Forecast(members.mean(-2), members.var(-2), y.new_ones(keep.shape))
-        return Answer(forecast, members, None, y.new_full(keep.shape, torch.nan))
+        forecast = Forecast(members.mean(-2), members.var(-2), y.new_ones(keep.shape), members)
+        return Answer(forecast, y.new_full(keep.shape, torch.nan))
 
 
 class NearestMethod:
@@ -117,10 +111,9 @@ class NearestMethod:
             values = torch.where(seen, y[i][:, used], 0) / deviation
             squares = (torch.where(seen.unsqueeze(1), paths - values.unsqueeze(1), 0)).square().sum(-1)
             chosen[i] = squares.cumsum(0)[keep[i]].argmin(-1)
-        members = self.ends[:, dofs][chosen].unsqueeze(-2)
-        mean = members.squeeze(-2)
+        mean = self.ends[:, dofs][chosen]
         at = (keep / primitive.rate * primitive.phase_velocity[chosen]).to(y)
-        return Answer(Forecast(mean, torch.full_like(mean, torch.nan), at), members, None, at)
+        return Answer(Forecast(mean, torch.full_like(mean, torch.nan), y.new_ones(keep.shape)), at)
 
 
 def evaluate(task: Task, methods: Mapping[str, Method], tests: Demonstrations) -> Values:
@@ -164,18 +157,16 @@ def _metrics(
         part = layout.slice(modality)
         columns = [order.index(dof) for dof in range(part.start, part.stop)]
         target = truth[:, part]
-        forecast = Forecast(*(field[:, k][..., columns] for field in answer.forecast[:2]), answer.forecast.phase)
-        members = answer.members[:, k][..., columns]
+        forecast = _at(answer.forecast, k).select(torch.tensor(columns))
         unit = layout[modality].unit
-        lead = task.leading.get(modality, len(columns))
-        first = Forecast(forecast.mean[:, :lead], forecast.variance[:, :lead], forecast.phase)
-        found.append((Cell(subset, fraction, "mse", modality, f"{unit}^2"), measure.mse(first, target[:, :lead])))
+        lead = torch.arange(task.leading.get(modality, len(columns)))
+        squares = measure.mse(forecast.select(lead), target[:, lead])
+        found.append((Cell(subset, fraction, "mse", modality, f"{unit}^2"), squares))
         found.append((Cell(subset, fraction, "mae", modality, unit), measure.mae(forecast, target)))
-        if members.shape[-2] > 1:
-            weights = None if answer.weights is None else answer.weights[:, k]
+        if not forecast.variance.isnan().all():
             inside = measure.coverage_95(forecast, target)
             found.append((Cell(subset, fraction, "coverage_95", modality, "1"), inside))
-            found.append((Cell(subset, fraction, "crps", modality, unit), measure.crps(members, target, weights)))
+            found.append((Cell(subset, fraction, "crps", modality, unit), measure.crps(forecast, target)))
     if task.arm is not None:
         arm, modality = task.arm
         part = layout.slice(modality)
@@ -187,6 +178,12 @@ def _metrics(
             (Cell(subset, fraction, "phase_error", None, "1"), measure.phase_error(answer.phase[:, k], phase))
         )
     return found
+
+
+def _at(forecast: Forecast, k: int) -> Forecast:
+    """The forecast at one of the fractions: [B, K, ...] -> [B, ...]."""
+    fields = (None if field is None else field[:, k] for field in forecast[:5])
+    return Forecast(*fields, forecast.fair)
 
 
 def _ends(primitive: InteractionPrimitive) -> Tensor:

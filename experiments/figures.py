@@ -13,8 +13,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from torch_ebip import Demonstrations, EnsembleFilter
-from torch_ebip.filters.ebip import restrict
+from torch_ebip import Demonstrations, Filter
 from torch_ebip.layout import Layout
 from torch_ebip.metrics import Z95
 from torch_ebip.noise import MeasurementNoise
@@ -54,7 +53,7 @@ def results_figure(results: Mapping[str, Any], panels: Sequence[tuple[str, str |
 
 
 def forecast_figure(
-    filters: Mapping[str, EnsembleFilter],
+    filters: Mapping[str, Filter],
     tests: Demonstrations,
     index: int,
     subset: Tensor,
@@ -75,7 +74,7 @@ def forecast_figure(
         y = trajectory[: now + 1, used]
         observed = subset[used] & ~y.isnan()
         for label, whole in filters.items():
-            part = restrict(whole, used)
+            part = whole.restrict(used)
             with torch.no_grad():
                 trace = part(y, observed, generator=torch.Generator().manual_seed(0), project=False)
                 phase = torch.linspace(now / last, 1, 60)
@@ -99,7 +98,7 @@ def forecast_figure(
     return figure
 
 
-def noise_figure(filter: EnsembleFilter, closed_form: Tensor, layout: Layout, shown: Sequence[str]) -> Figure:
+def noise_figure(filter: Filter, closed_form: Tensor, layout: Layout, shown: Sequence[str]) -> Figure:
     """The learned R relative to the closed form over phase, a line a modality (geometric mean over its DoFs)."""
     noise = filter.noise.measurement
     if not isinstance(noise, MeasurementNoise):

@@ -8,7 +8,6 @@ import torch
 from tests.conftest import interactions, small_primitive
 from torch_ebip import BSplineBasis, EnsembleFilter, ebip
 from torch_ebip.checkpoint import load_checkpoint, save_checkpoint
-from torch_ebip.filters.ebip import restrict
 from torch_ebip.kinematics import RobotArm
 from torch_ebip.losses import ForwardKinematicsLoss
 from torch_ebip.noise import AboveOne
@@ -229,7 +228,7 @@ def test_the_tool_counts_through_the_arm() -> None:
     with pytest.raises(ValueError, match="tool term needs an arm"):
         ForecastObjective(primitive, six, weights=Weights(tool=1.0))
     arm = ForwardKinematicsLoss(RobotArm.ur5().double())
-    made = restrict(ebip(primitive, square_root=True), six)
+    made = ebip(primitive, square_root=True).restrict(six)
     state = made.initial_state()
     state, _ = made.update(state, torch.zeros(5, dtype=torch.float64), SUBSETS["both"])
     ends = made.forecast(state, torch.ones(1)).mean[0]

@@ -14,7 +14,18 @@ from torch_ebip.basis import (
     select_basis,
 )
 from torch_ebip.demonstrations import Demonstrations
-from torch_ebip.filters import EnsembleFilter, Filter, Forecast, Trace, ebip
+from torch_ebip.filters import (
+    EnsembleFilter,
+    ExtendedFilter,
+    Filter,
+    Forecast,
+    ParticleFilter,
+    Trace,
+    bip,
+    ebip,
+    ebip_minus,
+    particle_filter,
+)
 from torch_ebip.kinematics import RobotArm
 from torch_ebip.layout import Layout, Modality
 from torch_ebip.losses import ForwardKinematicsLoss
@@ -25,6 +36,7 @@ __all__ = [
     "Basis",
     "Demonstrations",
     "EnsembleFilter",
+    "ExtendedFilter",
     "Filter",
     "Forecast",
     "ForwardKinematicsLoss",
@@ -32,12 +44,16 @@ __all__ = [
     "InteractionPrimitive",
     "Layout",
     "Modality",
+    "ParticleFilter",
     "PolynomialBasis",
     "RobotArm",
     "SigmoidBasis",
     "StackedBasis",
     "Trace",
+    "bip",
     "ebip",
+    "ebip_minus",
     "functional",
+    "particle_filter",
     "select_basis",
 ]

@@ -128,7 +128,7 @@ def square_root_update(
     R = innovation.noise @ innovation.noise.transpose(-1, -2)
     if innovation.observed is not None:
         R = R + torch.diag_embed((~innovation.observed).to(R))
-    U = _cholesky(R, innovation.rows)
+    U = cholesky(R, innovation.rows)
     shift = torch.cholesky_solve(innovation.residual.unsqueeze(-1), V).transpose(-1, -2)
     shrink = torch.linalg.solve_triangular(V + U, innovation.anomalies.transpose(-1, -2), upper=False)
     shrink = torch.linalg.solve_triangular(V.transpose(-1, -2), shrink, upper=True).transpose(-1, -2)
@@ -141,22 +141,27 @@ def ensemble_mean(members: Tensor, weights: Tensor | None = None) -> Tensor:
     return members.mean(-2) if weights is None else (weights.unsqueeze(-2) @ members).squeeze(-2)
 
 
-def ensemble_variance(members: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Unbiased variance [..., n] of members [..., E, n] with weights [..., E]; default: equal ones."""
+def ensemble_variance(members: Tensor, weights: Tensor | None = None, unbiased: bool = True) -> Tensor:
+    """Variance [..., n] of members [..., E, n] with weights [..., E]; default: equal ones.
+
+    Unbiased for members that are draws; otherwise that of the members as a distribution of their own.
+    """
     anomalies = members - ensemble_mean(members, weights).unsqueeze(-2)
-    return (anomalies.square() * _shares(members, weights)).sum(-2)
+    return (anomalies.square() * _shares(members, weights, unbiased)).sum(-2)
 
 
-def ensemble_covariance(members: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Unbiased covariance [..., n, n] of members [..., E, n] with weights [..., E]; default: equal ones."""
+def ensemble_covariance(members: Tensor, weights: Tensor | None = None, unbiased: bool = True) -> Tensor:
+    """Covariance [..., n, n] of members [..., E, n] with weights [..., E]; otherwise as `ensemble_variance`."""
     anomalies = members - ensemble_mean(members, weights).unsqueeze(-2)
-    return (anomalies * _shares(members, weights)).transpose(-1, -2) @ anomalies
+    return (anomalies * _shares(members, weights, unbiased)).transpose(-1, -2) @ anomalies
 
 
-def _shares(members: Tensor, weights: Tensor | None) -> Tensor:
+def _shares(members: Tensor, weights: Tensor | None, unbiased: bool = True) -> Tensor:
     """What each member's squared anomaly counts in a covariance, [..., E, 1] or [1]."""
     if weights is None:
-        return members.new_tensor([1 / (members.shape[-2] - 1)])
+        return members.new_tensor([1 / (members.shape[-2] - unbiased)])
+    if not unbiased:
+        return weights.unsqueeze(-1)
     return (weights / (1 - weights.square().sum(-1, keepdim=True))).unsqueeze(-1)
 
 
@@ -166,6 +171,35 @@ def inflate(members: Tensor, factor: Tensor | float, weights: Tensor | None = No
     # Added rather than scaled: a factor of exactly 1 leaves the members as they are, to the bit.
     growth = torch.as_tensor(factor, dtype=members.dtype, device=members.device) - 1
     return torch.addcmul(members, anomalies, growth[..., None, None])
+
+
+def systematic_resample(log_weights: Tensor, u: Tensor) -> Tensor:
+    """Ancestors of E particles by systematic resampling (Kitagawa 1996): one uniform draw for all.
+
+    Particle j has floor(E w_j) or ceil(E w_j) offspring, E w_j in the mean; ancestors come in ascending order.
+
+    Args:
+        log_weights: [..., E], need not be normalised; at least one of them finite.
+        u: [...], uniform in [0, 1).
+
+    Returns:
+        int64 [..., E], indices of the particles that the new ones are copies of.
+
+    Raises:
+        ValueError: shapes that do not fit, or weights of which none is positive.
+    """
+    if u.shape != log_weights.shape[:-1]:
+        raise ValueError(
+            f"u must have one number for each row of log_weights, {list(log_weights.shape[:-1])}, got {list(u.shape)}"
+        )
+    E = log_weights.shape[-1]
+    cumulative = torch.softmax(log_weights, dim=-1).cumsum(-1)
+    if not bool(cumulative.isfinite().all()):
+        raise ValueError("log_weights hold NaN, or a row without any positive weight")
+    positions = (u.unsqueeze(-1) + torch.arange(E, dtype=u.dtype, device=u.device)) / E
+    # Rounding can leave the last sum below 1 and the last position above it.
+    cumulative = cumulative / cumulative[..., -1:]
+    return torch.searchsorted(cumulative.contiguous(), positions.contiguous(), right=True).clamp(max=E - 1)
 
 
 def _check(members: Tensor, projections: Tensor, y: Tensor, noise_cholesky: Tensor, observed: Tensor | None) -> None:
@@ -230,7 +264,7 @@ def _innovation(
     S = covariance + noise @ noise.transpose(-1, -2)
     if observed is not None:
         S = S + torch.diag_embed((~observed).to(S))
-    return _Innovation(rows, scale, anomalies, weighted, (y - mean) / scale, _cholesky(S, rows), noise, observed)
+    return _Innovation(rows, scale, anomalies, weighted, (y - mean) / scale, cholesky(S, rows), noise, observed)
 
 
 def _through_gain(
@@ -270,7 +304,16 @@ def _nothing_observed(members: Tensor, projections: Tensor, y: Tensor) -> tuple[
     return members, torch.zeros_like(projections[..., 0, 0] + torch.where(y.isnan(), 0, y)[..., 0])
 
 
-def _cholesky(matrix: Tensor, rows: Tensor | None) -> Tensor:
+def cholesky(matrix: Tensor, rows: Tensor | None = None) -> Tensor:
+    """Lower Cholesky factor of covariances [..., D, D] of observations, or an error that says what to do.
+
+    Args:
+        matrix: symmetric positive definite.
+        rows: int64 [D], which DoFs these are, for the error; default: the first D.
+
+    Raises:
+        FactorisationError: names the batch entries and the DoFs.
+    """
     factor: Tensor
     factor, info = torch.linalg.cholesky_ex(matrix)
     if bool(info.any()):

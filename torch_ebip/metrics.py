@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from torch_ebip.filters.base import Forecast
+from torch_ebip.filters.forecast import Forecast
 from torch_ebip.kinematics import RobotArm
-from torch_ebip.scores import crps as ensemble_crps
 
 Z95 = 1.959963984540054
 """Half-width of the central 95 % interval of a normal distribution, in standard deviations."""
@@ -28,9 +27,9 @@ def coverage_95(forecast: Forecast, target: Tensor) -> Tensor:
     return inside.to(target.dtype).where(~target.isnan(), target).nanmean(-1)
 
 
-def crps(members: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Fair CRPS averaged over DoFs: members [..., E, D], target [..., D], weights [..., E] -> [...], DoFs' units."""
-    return ensemble_crps(members, target, weights).nanmean(-1)
+def crps(forecast: Forecast, target: Tensor) -> Tensor:
+    """CRPS averaged over DoFs: forecast [..., D], target [..., D] -> [...], units of the DoFs."""
+    return forecast.crps(target).nanmean(-1)
 
 
 def phase_error(phase: Tensor, true_phase: Tensor) -> Tensor:

@@ -7,10 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torch_ebip.filters.base import Trace
-from torch_ebip.filters.ensemble import EnsembleFilter
-from torch_ebip.functional import ensemble_mean, ensemble_variance
-from torch_ebip.losses import CRPSLoss, ForwardKinematicsLoss, InnovationLikelihoodLoss, TrajectoryLoss
+from torch_ebip.filters.base import Filter, Trace
+from torch_ebip.losses import ForwardKinematicsLoss, InnovationLikelihoodLoss, TrajectoryLoss
 from torch_ebip.primitive import InteractionPrimitive
 
 
@@ -18,7 +16,7 @@ class Weights(NamedTuple):
     """How much each term of the objective counts; a term of weight 0 is not computed.
 
     Attributes:
-        crps: fair CRPS of the forecast ensemble, DoFs in units of their spread over the demonstrations:
+        crps: CRPS of the forecast, DoFs in units of their spread over the demonstrations:
             accuracy and calibration.
         squared_error: of the ensemble mean, in the same units squared.
         tool: distance of the arm's tool in metres (needs an arm).
@@ -50,6 +48,7 @@ class ForecastObjective(nn.Module):
     """
 
     phases: Tensor
+    scale: Tensor
 
     def __init__(
         self,
@@ -70,7 +69,7 @@ class ForecastObjective(nn.Module):
             names = [dof for dof, still in zip(primitive.layout.dofs, fixed.tolist(), strict=True) if still]
             raise ValueError(f"targets must be DoFs that end differently in different demonstrations, got {names}")
         scale = ends.sqrt()[targets]
-        self.crps = CRPSLoss(scale)
+        self.register_buffer("scale", scale)
         self.squared_error = TrajectoryLoss(scale)
         self.innovation = InnovationLikelihoodLoss()
         self.arm = arm
@@ -79,7 +78,7 @@ class ForecastObjective(nn.Module):
         self.register_buffer("phases", phases)
 
     def forward(
-        self, filter: EnsembleFilter, trace: Trace, observed: Tensor, truth: Tensor, now: Tensor, targets: Tensor
+        self, filter: Filter, trace: Trace, observed: Tensor, truth: Tensor, now: Tensor, targets: Tensor
     ) -> dict[str, Tensor]:
         """Weighted terms by name; their sum is the loss.
 
@@ -96,16 +95,14 @@ class ForecastObjective(nn.Module):
         """
         if trace.kept is None:
             raise ValueError("the trace kept no states to forecast from")
-        members = filter.forecast_members(trace.kept, self.phases_ahead(now))[..., targets]
-        weights = None if trace.kept.weights is None else trace.kept.weights.unsqueeze(-2)
-        mean = ensemble_mean(members, weights)
+        forecast = filter.forecast(trace.kept, self.phases_ahead(now)).select(targets)
         terms = {}
         if self.weights.crps:
-            terms["crps"] = self.weights.crps * self.crps(members, truth, weights)
+            terms["crps"] = self.weights.crps * (forecast.crps(truth) / self.scale).mean()
         if self.weights.squared_error:
-            terms["squared_error"] = self.weights.squared_error * self.squared_error(mean, truth)
+            terms["squared_error"] = self.weights.squared_error * self.squared_error(forecast.mean, truth)
         if self.weights.tool and self.arm is not None:
-            joints, wanted = mean[..., -1, self.arm_dofs], truth[..., -1, self.arm_dofs]
+            joints, wanted = forecast.mean[..., -1, self.arm_dofs], truth[..., -1, self.arm_dofs]
             terms["tool"] = self.weights.tool * self.arm(joints, wanted)
         if self.weights.innovation:
             terms["innovation"] = self.weights.innovation * self.innovation(trace.log_likelihood, observed)
@@ -115,7 +112,7 @@ class ForecastObjective(nn.Module):
         """Phases [..., P] that are scored from horizons now [...]."""
         return now.unsqueeze(-1) + (1 - now.unsqueeze(-1)) * self.phases
 
-    def spread_and_error(self, filter: EnsembleFilter, trace: Trace, truth: Tensor, targets: Tensor) -> Tensor:
+    def spread_and_error(self, filter: Filter, trace: Trace, truth: Tensor, targets: Tensor) -> Tensor:
         """[2]: root mean variance of the forecasts of phase 1 and root mean squared error of their mean.
 
         Both in units of the targets' spread over the demonstrations; equal for a calibrated filter.
@@ -123,7 +120,7 @@ class ForecastObjective(nn.Module):
         if trace.kept is None:
             raise ValueError("the trace kept no states to forecast from")
         end = torch.ones(1, dtype=truth.dtype, device=truth.device)
-        members = filter.forecast_members(trace.kept, end)[..., 0, :, :][..., targets] / self.crps.scale
-        error = ensemble_mean(members, trace.kept.weights) - truth[..., -1, :] / self.crps.scale
-        variance = ensemble_variance(members, trace.kept.weights)
+        forecast = filter.forecast(trace.kept, end).select(targets)
+        error = (forecast.mean[..., 0, :] - truth[..., -1, :]) / self.scale
+        variance = forecast.variance / self.scale.square()
         return torch.stack([variance.mean().sqrt(), error.square().mean().sqrt()])

@@ -1,12 +1,14 @@
-"""Proper scores of an ensemble forecast (Gneiting & Raftery 2007): calibration and accuracy in one number."""
+"""Proper scores of a forecast (Gneiting & Raftery 2007): calibration and accuracy in one number."""
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch import Tensor
 
 
-def crps(members: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
+def crps(members: Tensor, target: Tensor, weights: Tensor | None = None, fair: bool = True) -> Tensor:
     """Continuous ranked probability score, fair for finite ensembles (Ferro 2014), in O(E log E) by sorting.
 
     sum_j w_j |x_j - y| - sum_jk w_j w_k |x_j - x_k| / (2 (1 - sum_j w_j^2)).
@@ -15,6 +17,7 @@ def crps(members: Tensor, target: Tensor, weights: Tensor | None = None) -> Tens
         members: [..., E, D], E >= 2.
         target: [..., D].
         weights: of the members, [..., E], summing to 1; default: equal.
+        fair: without it the last divisor is 2, the score of the members as a distribution of their own.
 
     Returns:
         [..., D], units of the DoFs; smaller is better.
@@ -31,7 +34,26 @@ def crps(members: Tensor, target: Tensor, weights: Tensor | None = None) -> Tens
     # Half of sum_jk w_j w_k |x_j - x_k| is sum_j w_j x_(j) (2 W_j - 1), W_j the weight up to the middle of j.
     spread = (sorted_shares * (2 * below - 1) * ordered).sum(-2)
     error = (shares * (members - target.unsqueeze(-2)).abs()).sum(-2)
-    return error - spread / (1 - weights.square().sum(-1, keepdim=True))
+    return error - (spread / (1 - weights.square().sum(-1, keepdim=True)) if fair else spread)
+
+
+def gaussian_crps(mean: Tensor, variance: Tensor, target: Tensor) -> Tensor:
+    """The CRPS of a normal distribution (Gneiting & Raftery 2007, equation 21).
+
+    Args:
+        mean: [..., D].
+        variance: [..., D], squared units; where it is 0 the score is the absolute error.
+        target: [..., D].
+
+    Returns:
+        [..., D], units of the DoFs; smaller is better.
+    """
+    positive = variance > 0
+    deviation = torch.where(positive, variance, 1).sqrt()
+    z = (target - mean) / deviation
+    density = torch.exp(-0.5 * z.square()) / math.sqrt(2 * math.pi)
+    score = deviation * (z * (2 * torch.special.ndtr(z) - 1) + 2 * density - 1 / math.sqrt(math.pi))
+    return torch.where(positive, score, (target - mean).abs())
 
 
 def energy_score(members: Tensor, target: Tensor) -> Tensor:

@@ -83,7 +83,7 @@ def test_a_killed_run_resumes_to_the_same_table(recordings: str, tmp_path: Path)
     root = Path(tune.__file__).parents[1]
     run = tmp_path / "killed"
     started = subprocess.Popen([*command, str(run)], cwd=root, start_new_session=True, stderr=subprocess.DEVNULL)
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 400
     while not (run / "fold-01" / "checkpoint.pt").exists() and time.monotonic() < deadline:
         time.sleep(0.01)
     os.killpg(started.pid, signal.SIGKILL)

@@ -12,7 +12,7 @@ import torch
 
 from tests.conftest import interactions
 from torch_ebip import Filter
-from torch_ebip.filters.base import map_state
+from torch_ebip.filters.sequence import map_state
 
 
 class FilterContract:

@@ -7,7 +7,6 @@ import torch
 from tests.conftest import interactions, small_primitive
 from tests.filters.contract import FilterContract
 from torch_ebip import BSplineBasis, Demonstrations, EnsembleFilter, InteractionPrimitive, ebip
-from torch_ebip.filters.ebip import restrict
 from torch_ebip.noise import AboveOne, Positive
 
 
@@ -131,7 +130,7 @@ def test_leaving_out_dofs_that_nobody_asks_for_is_exact() -> None:
     y, observed = interactions(2, seed=3, dtype=torch.float64).pad()
     y, observed = y[:, :20], observed[:, :20] & torch.tensor([True, False, True, False, False])
     dofs = torch.tensor([True, False, True, False, True])
-    part = restrict(whole, dofs)
+    part = whole.restrict(dofs)
     a = whole(y, observed, generator=torch.Generator().manual_seed(0))
     b = part(y[..., dofs], observed[..., dofs], generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(a.projection[..., dofs], b.projection)
@@ -147,7 +146,7 @@ def test_thinning_stands_for_the_samples_left_out() -> None:
     y, observed = y[:, :29], observed[:, :29] & torch.tensor([True, True, True, False, False])
     every = torch.ones(5, dtype=torch.bool)
     full = made.forecast(made(y, observed, generator=torch.Generator().manual_seed(0)).state, torch.ones(1))
-    thin = restrict(made, every, 4)
+    thin = made.restrict(every, 4)
     assert thin.dt == pytest.approx(4 * made.dt)
     trace = thin(y[:, ::4], observed[:, ::4], generator=torch.Generator().manual_seed(0))
     sparse = thin.forecast(trace.state, torch.ones(1))
@@ -162,7 +161,7 @@ def test_restricting_twice_is_restricting_once() -> None:
     y, observed = interactions(2, seed=3, dtype=torch.float64).pad()
     y, observed = y[:, :20:4], observed[:, :20:4]
     first, last = torch.tensor([False, True, True, False, True]), torch.tensor([False, False, True, False, True])
-    once, twice = restrict(whole, last, 4), restrict(restrict(whole, first, 2), last[first], 2)
+    once, twice = whole.restrict(last, 4), whole.restrict(first, 2).restrict(last[first], 2)
     assert twice.thinning == once.thinning == 4
     assert twice.dt == pytest.approx(once.dt)
     a, b = (f(y[..., last], observed[..., last], generator=torch.Generator().manual_seed(0)) for f in (once, twice))

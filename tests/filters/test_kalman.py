@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from torch_ebip import EnsembleFilter
-from torch_ebip.filters import FilterNoise, GaussianPrior
-from torch_ebip.noise import MeasurementNoise, NoProcessNoise
+from torch_ebip.filters import GaussianPrior
+from torch_ebip.noise import FilterNoise, MeasurementNoise, NoProcessNoise
 
 
 class Linear(nn.Module):

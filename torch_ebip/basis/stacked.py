@@ -100,6 +100,48 @@ class StackedBasis(nn.Module):
         features = [basis(phase) for basis in self._families()]
         return [self._project(features, part, dofs) for part in weights]
 
+    def project_rows(self, phase: Tensor, matrix: Tensor) -> Tensor:
+        """h(phi, row) of every row of a matrix: with a covariance of the weights, the product with dh/dw'.
+
+        Costs one multiplication an entry of the matrix, because each DoF sees only its own weights.
+
+        Args:
+            phase: [...].
+            matrix: [..., m, n_weights].
+
+        Returns:
+            [..., m, D].
+        """
+        features = [basis(phase) for basis in self._families()]
+        parts = []
+        for run in self._runs:
+            block = matrix[..., run.weights]
+            shape = (*block.shape[:-1], run.dofs.stop - run.dofs.start)
+            flat = block.reshape(*block.shape[:-2], -1, features[run.basis].shape[-1])
+            parts.append((flat @ features[run.basis].unsqueeze(-1)).reshape(shape))
+        return torch.cat(parts, dim=-1)
+
+    def project_covariance(self, phase: Tensor, covariance: Tensor) -> Tensor:
+        """Variance of h(phi, w) for normal weights, Phi_d Sigma_dd Phi_d' for each DoF d.
+
+        Args:
+            phase: [..., P].
+            covariance: Sigma of the weights, [..., n_weights, n_weights].
+
+        Returns:
+            [..., P, D], squared units of the DoFs.
+        """
+        features = [basis(phase) for basis in self._families()]
+        parts = []
+        for run in self._runs:
+            functions = features[run.basis]
+            split = (run.dofs.stop - run.dofs.start, functions.shape[-1])
+            blocks = covariance[..., run.weights, run.weights]
+            blocks = blocks.reshape(*blocks.shape[:-2], *split, *split)
+            own = blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)
+            parts.append(torch.einsum("...pa,...kab,...pb->...pk", functions, own, functions))
+        return torch.cat(parts, dim=-1)
+
     def _families(self) -> list[Basis]:
         return list(self.unique)  # type: ignore[arg-type]
 

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
-State = Any
-"""A NamedTuple of tensors with leading batch dimensions; every filter has its own."""
+from torch_ebip.filters.attribution import affine_coefficients
+from torch_ebip.filters.forecast import Forecast
+from torch_ebip.filters.model import InteractionModel, select_dofs
+from torch_ebip.filters.sequence import Segment, State, assemble, checkpointed, pick
+from torch_ebip.functional import FactorisationError
+from torch_ebip.noise.pair import FilterNoise
 
 
 class Trace(NamedTuple):
@@ -33,37 +36,42 @@ class Trace(NamedTuple):
     kept: State | None
 
 
-class Forecast(NamedTuple):
-    """What the filter expects at some phases.
-
-    Attributes:
-        mean: [..., P, D], units of the DoFs.
-        variance: [..., P, D], of the filter's belief about the noise-free trajectory; squared units.
-        phase: [..., P].
-    """
-
-    mean: Tensor
-    variance: Tensor
-    phase: Tensor
-
-
 class Filter(nn.Module, ABC):
     """A Bayesian filter over interactions, differentiable in its noise parameters.
 
     Args:
-        dt: seconds between samples where none is given.
+        dynamics: g, advances states by dt.
+        observation: h, from states to values of the DoFs.
+        noise: Q and R.
+        prior: where states start.
         n_dofs: D.
+        dt: seconds between samples where none is given.
+        thinning: how many samples each one given stands for; see `restrict`.
+        dof_names: for error messages.
     """
 
-    dt: float
-    n_dofs: int
-
-    def __init__(self, dt: float, n_dofs: int) -> None:
+    def __init__(
+        self,
+        dynamics: nn.Module,
+        observation: nn.Module,
+        noise: FilterNoise,
+        prior: nn.Module,
+        n_dofs: int,
+        dt: float,
+        thinning: int = 1,
+        dof_names: tuple[str, ...] | None = None,
+    ) -> None:
         super().__init__()
         if not dt > 0:
             raise ValueError(f"dt must be a positive number of seconds, got {dt}")
-        self.dt = dt
+        self.dynamics = dynamics
+        self.observation = observation
+        self.noise = noise
+        self.prior = prior
         self.n_dofs = n_dofs
+        self.dt = dt
+        self.thinning = thinning
+        self.dof_names = dof_names
 
     @abstractmethod
     def initial_state(
@@ -107,9 +115,53 @@ class Filter(nn.Module, ABC):
             phase: [P] or [..., P]; default: 50 phases evenly from the current one to 1.
         """
 
+    @abstractmethod
+    def restrict(self, dofs: Tensor, thinning: int = 1) -> Filter:
+        """The same filter for some of the DoFs, sharing its parameters: not a copy.
+
+        DoFs that are neither measured nor asked for influence nothing, so leaving out their weights is exact,
+        and it saves their share of every update.
+
+        Args:
+            dofs: bool [D], those to keep.
+            thinning: use it for sequences of which only every k-th sample is left: each stands for k, so R is
+                divided by k, process noise follows, and the time between samples grows with it.
+
+        Raises:
+            TypeError: the filter is not one of an interaction primitive.
+        """
+
+    def attribution(self, state: State) -> Tensor:
+        """Which demonstrations speak: the mean forecast is this affine combination of their trajectories.
+
+        Each forecast's mean is sum_i c_i h(phase, w_i), because nothing ever leaves the span of the
+        demonstrations. See `torch_ebip.filters.attribution`.
+
+        Args:
+            state: of this filter.
+
+        Returns:
+            c, [..., N], summing to 1.
+
+        Raises:
+            TypeError: the prior knows no demonstrations.
+            ValueError: an option moves weights out of the span; says which.
+        """
+        states = getattr(self.prior, "states", None)
+        if not isinstance(states, Tensor):
+            raise TypeError(f"a {type(self.prior).__name__} knows no demonstrations that forecasts could rest on")
+        reason = self._leaves_span()
+        if reason is not None:
+            raise ValueError(f"forecasts are no combination of the demonstrations: {reason}")
+        return affine_coefficients(states[:, 2:], state.mean[..., 2:])
+
+    def _leaves_span(self) -> str | None:
+        """What moves weights out of the span of the demonstrations, if anything does."""
+        return "weights have process noise" if getattr(self.noise.process, "weights", None) is not None else None
+
     def predict(self, state: State, dt: float | Tensor, generator: torch.Generator | None = None) -> State:
         """Propagate by dt seconds: a number, or a tensor [...] with one for each entry of the batch."""
-        return self._predict(state, torch.as_tensor(dt).to(state[0]), generator)
+        return self._predict(state, torch.as_tensor(dt, dtype=state[0].dtype, device=state[0].device), generator)
 
     def update(
         self,
@@ -180,11 +232,11 @@ class Filter(nn.Module, ABC):
             keep.shape[:-1] != batch or keep.numel() == 0 or int(keep.min()) < 0 or int(keep.max()) >= length
         ):
             raise ValueError(f"keep must be [{', '.join(map(str, batch))}, K] with steps 0..{length - 1}, got {keep}")
-        step = torch.as_tensor(self.dt if dt is None else dt).to(state[0])
+        step = torch.as_tensor(self.dt if dt is None else dt, dtype=state[0].dtype, device=state[0].device)
 
-        def run(state: State, start: int, stop: int, generator: torch.Generator | None) -> _Segment:
+        def run(state: State, start: int, stop: int, generator: torch.Generator | None) -> Segment:
             """Samples start to stop - 1."""
-            record = _Segment(state, [], [], [], [])
+            record = Segment(state, [], [], [], [])
             for t in range(start, stop):
                 if t > 0:
                     state = self._predict(state, step, generator)
@@ -193,13 +245,13 @@ class Filter(nn.Module, ABC):
                 record.phase.append(self.phase(state).expand(batch))
                 record.projection.append(self.project(state) if project else state[0].new_zeros(*batch, 0))
                 if keep is not None:
-                    record.kept.extend(_pick(state, keep == t))
+                    record.kept.extend(pick(state, keep == t))
             return record._replace(state=state)
 
         segments = []
         for start in range(0, length, segment or length):
             stop = min(start + (segment or length), length)
-            execute = partial(_checkpointed, run) if segment else run
+            execute = partial(checkpointed, run) if segment else run
             done = execute(state, start, stop, generator)
             state = done.state
             segments.append(done)
@@ -208,8 +260,29 @@ class Filter(nn.Module, ABC):
             torch.stack([phase for part in segments for phase in part.phase], -1),
             torch.stack([value for part in segments for value in part.log_likelihood], -1),
             torch.stack([value for part in segments for value in part.projection], -2),
-            None if keep is None else _assemble([pick for part in segments for pick in part.kept], keep.shape),
+            None if keep is None else assemble([pick for part in segments for pick in part.kept], keep.shape),
         )
+
+    def _phases_ahead(self, state: State) -> Tensor:
+        """50 phases [..., 50] evenly from the current one to 1."""
+        now = self.phase(state).clamp(0, 1).unsqueeze(-1)
+        return now + (1 - now) * torch.linspace(0, 1, 50, dtype=now.dtype, device=now.device)
+
+    def _deviation(self, phase: Tensor | None) -> Tensor:
+        """Standard deviations of a sample, [D] or [..., D], at phases [...]; units of the DoFs."""
+        deviation: Tensor = self.noise.measurement(phase) / math.sqrt(self.thinning)
+        return deviation
+
+    def _select(self, dofs: Tensor, thinning: int) -> InteractionModel:
+        """The parts of a restricted filter; see `restrict`."""
+        return select_dofs(self.dynamics, self.observation, self.noise, self.dt, self.dof_names, dofs, thinning)
+
+    def _named(self, error: FactorisationError, rows: Tensor | None) -> ValueError:
+        """The error of a factorisation over some DoFs, int64 [k] (None for all), with their names."""
+        if self.dof_names is None:
+            return error
+        names = (self.dof_names[i if rows is None else int(rows[i])] for i in error.dofs)
+        return ValueError(f"{error} ({', '.join(names)})")
 
     def _checked(self, y: Tensor, observed: Tensor | None) -> tuple[Tensor, Tensor]:
         if y.shape[-1:] != (self.n_dofs,):
@@ -225,69 +298,3 @@ class Filter(nn.Module, ABC):
             columns = bad.reshape(-1, self.n_dofs).any(0).nonzero().squeeze(-1).tolist()
             raise ValueError(f"y is NaN or infinite where it is observed, in DoFs {columns[:8]}; mark it False there")
         return y, observed.expand(y.shape)
-
-
-class _Segment(NamedTuple):
-    state: State
-    phase: list[Tensor]
-    log_likelihood: list[Tensor]
-    projection: list[Tensor]
-    kept: list[tuple[tuple[int, ...], State]]
-
-
-def _checkpointed(
-    run: Callable[..., _Segment], state: State, start: int, stop: int, generator: torch.Generator | None
-) -> _Segment:
-    """Run a segment so that its backward pass repeats it with the same draws.
-
-    The global generator is saved by torch's own checkpointing; an explicit one is replayed from its state.
-    """
-    if generator is None:
-        return checkpoint(run, state, start, stop, None, use_reentrant=False)  # type: ignore[no-any-return]
-    beginning = generator.get_state()
-    ends = []
-
-    def replay(state: State) -> _Segment:
-        """The segment with the draws of the first time."""
-        again = torch.Generator(generator.device)
-        again.set_state(beginning)
-        done = run(state, start, stop, again)
-        ends.append(again.get_state())
-        return done
-
-    done = checkpoint(replay, state, use_reentrant=False)
-    generator.set_state(ends[0])
-    return done  # type: ignore[no-any-return]
-
-
-def _pick(state: State, here: Tensor) -> list[tuple[tuple[int, ...], State]]:
-    """The entries of a batch that are to be kept now, with their place [*batch, K]."""
-    if not bool(here.any()):
-        return []
-    places = [tuple(index) for index in here.nonzero().tolist()]
-
-    def entry(index: tuple[int, ...], part: Tensor) -> Tensor:
-        """One entry of the batch."""
-        return part[index]
-
-    return [(place, map_state(partial(entry, place[:-1]), state)) for place in places]
-
-
-def _assemble(picked: list[tuple[tuple[int, ...], State]], shape: torch.Size) -> State:
-    ordered = [state for _, state in sorted(picked, key=lambda pair: pair[0])]
-
-    def stack(*parts: Tensor) -> Tensor:
-        """The entries in their places, [*shape, ...]."""
-        return torch.stack(parts).reshape(*shape, *parts[0].shape)
-
-    return map_state(stack, *ordered)
-
-
-def map_state(function: Callable[..., Tensor], *states: State) -> State:
-    """Apply a function to the corresponding tensors of states, which may be nested and hold None."""
-    first = states[0]
-    if first is None:
-        return None
-    if isinstance(first, Tensor):
-        return function(*states)
-    return type(first)(*(map_state(function, *parts) for parts in zip(*states, strict=True)))

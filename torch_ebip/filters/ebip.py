@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import copy
-
 import torch
 from torch import Tensor, nn
 
 from torch_ebip.basis.base import Basis
-from torch_ebip.filters.ensemble import EnsembleFilter, FilterNoise
+from torch_ebip.filters.ensemble import EnsembleFilter
 from torch_ebip.filters.evidence import EvidenceWeighting
-from torch_ebip.filters.interaction import BasisProjection, ConstantVelocityPhase
 from torch_ebip.filters.localisation import Localisation
+from torch_ebip.filters.mixture import MixturePrior, fit_responsibilities
+from torch_ebip.filters.model import demonstration_states, interaction_model
 from torch_ebip.filters.priors import DemonstrationPrior
-from torch_ebip.noise.measurement import MeasurementNoise, SelectedNoise
-from torch_ebip.noise.process import InteractionNoise, PhaseNoise, WeightNoise
 from torch_ebip.primitive import InteractionPrimitive
 
 
@@ -49,90 +46,83 @@ def ebip(
     Returns:
         A filter with parameters of its own, in the dtype and on the device of the primitive.
     """
-    layout, basis = primitive.layout, copy.deepcopy(primitive.basis)
-    weights, velocity = primitive.weights, primitive.phase_velocity
-    states = torch.cat([torch.zeros_like(velocity)[:, None], velocity[:, None], weights], dim=-1)
-    modality_of_dof = layout.modality_of_dof.to(weights.device)
-    modality_of_weight = modality_of_dof[basis.dof_of_weight().to(weights.device)]
-    walk = None
-    if weight_noise is not None:
-        rates = weights.new_full((len(layout.modalities),), weight_noise)
-        walk = WeightNoise(rates, weights.std(0), modality_of_weight)
-    variance = primitive.residual_variance if residual_variance is None else residual_variance
-    noise = FilterNoise(
-        InteractionNoise(PhaseNoise(_acceleration(primitive)), walk),
-        MeasurementNoise(variance.to(weights), context, modality_of_dof),
-    )
+    prior = DemonstrationPrior(demonstration_states(primitive))
+    count = len(primitive) if n_members is None else n_members
+    options = (residual_variance, weight_noise, context, localise, inflation, square_root, weigh)
+    return _build(primitive, prior, count, *options)
+
+
+def ebip_minus(
+    primitive: InteractionPrimitive,
+    n_members: int,
+    *,
+    max_components: int = 4,
+    seed: int = 0,
+    residual_variance: Tensor | None = None,
+    weight_noise: float | None = None,
+    context: Basis | None = None,
+    localise: bool = False,
+    inflation: float | nn.Module | None = None,
+    square_root: bool = False,
+) -> EnsembleFilter:
+    """The paper's eBIP-: members are drawn from a Gaussian mixture over the demonstrations' weights.
+
+    Expectation maximisation with the number of components by BIC; where no mixture is positive definite, the
+    sample mean and covariance, with a warning. See `MixturePrior`.
+
+    Args:
+        primitive: of the demonstrations.
+        n_members: E; may be more than there are demonstrations.
+        max_components: largest number of components to try.
+        seed: of the initialisation of EM.
+        residual_variance, weight_noise, context, localise, inflation, square_root: see `ebip`.
+
+    Returns:
+        A filter with parameters of its own, in the dtype and on the device of the primitive.
+
+    Raises:
+        ImportError: scikit-learn is not installed.
+    """
+    states = demonstration_states(primitive)
+    prior = MixturePrior(states, fit_responsibilities(primitive.weights, max_components, seed))
+    options = (residual_variance, weight_noise, context, localise, inflation, square_root, False)
+    return _build(primitive, prior, n_members, *options)
+
+
+def _build(
+    primitive: InteractionPrimitive,
+    prior: nn.Module,
+    n_members: int,
+    residual_variance: Tensor | None,
+    weight_noise: float | None,
+    context: Basis | None,
+    localise: bool,
+    inflation: float | nn.Module | None,
+    square_root: bool,
+    weigh: bool,
+) -> EnsembleFilter:
+    model = interaction_model(primitive, residual_variance, weight_noise, context)
+    layout = primitive.layout
     localisation = None
     if localise:
+        modality_of_weight = layout.modality_of_dof[model.observation.basis.dof_of_weight()]
         block = torch.cat([modality_of_weight.new_zeros(2), modality_of_weight + 1])
-        localisation = Localisation(("phase", *layout.names), block, modality_of_dof + 1).to(weights)
+        localisation = Localisation(("phase", *layout.names), block, layout.modality_of_dof + 1)
+        localisation = localisation.to(primitive.weights)
+    weighting = None
+    if weigh:
+        weighting = EvidenceWeighting(primitive.value_variance, layout.modality_of_dof.to(primitive.weights.device))
     return EnsembleFilter(
-        ConstantVelocityPhase(),
-        BasisProjection(basis),
-        noise,
-        DemonstrationPrior(states),
-        len(primitive) if n_members is None else n_members,
-        layout.n_dofs,
-        1 / primitive.rate,
+        model.dynamics,
+        model.observation,
+        model.noise,
+        prior,
+        n_members,
+        model.n_dofs,
+        model.dt,
         square_root,
         inflation,
         localisation,
-        EvidenceWeighting(primitive.value_variance, modality_of_dof) if weigh else None,
-        dof_names=layout.dofs,
+        weighting,
+        dof_names=model.dof_names,
     )
-
-
-def _acceleration(primitive: InteractionPrimitive) -> Tensor:
-    """Phase acceleration noise, 1/s^2, that over one interaction adds a tenth of the demonstrations' spread.
-
-    The paper leaves Q open. White accelerations over steps dt move the velocity by sigma sqrt(dt T) in T
-    seconds; that is set to 0.1 of the standard deviation of the phase velocities (at least 1 % of their mean).
-    """
-    velocity = primitive.phase_velocity
-    spread = torch.maximum(velocity.std(), 0.01 * velocity.mean())
-    return 0.1 * spread * (primitive.rate * velocity.mean()).sqrt()
-
-
-def restrict(whole: EnsembleFilter, dofs: Tensor, thinning: int = 1) -> EnsembleFilter:
-    """The same eBIP filter for some of the DoFs, bool [D], sharing its parameters: not a copy.
-
-    DoFs that are neither measured nor asked for influence nothing, so leaving out their weights is exact, and
-    it saves their share of every update.
-
-    Args:
-        whole: made by `ebip`.
-        dofs: bool [D], those to keep.
-        thinning: see `EnsembleFilter`; the time between samples grows with it.
-
-    Raises:
-        TypeError: the filter is not an eBIP.
-    """
-    observation, prior, process = whole.observation, whole.prior, whole.noise.process
-    if not isinstance(observation, BasisProjection) or not isinstance(process, InteractionNoise):
-        raise TypeError("only filters made by ebip can be restricted to some DoFs")
-    if not isinstance(prior, DemonstrationPrior):
-        raise TypeError("only a prior of demonstrations can be restricted to some DoFs")
-    dofs = dofs.to(prior.states.device)
-    index = dofs.nonzero().squeeze(-1)
-    weights = dofs[observation.basis.dof_of_weight().to(dofs.device)].nonzero().squeeze(-1)
-    state = torch.cat([torch.arange(2, device=weights.device), weights + 2])
-    localisation = whole.localisation
-    names = whole.dof_names
-    part = EnsembleFilter(
-        whole.dynamics,
-        BasisProjection(observation.basis.select(dofs.cpu())),
-        FilterNoise(process.select(weights, thinning), SelectedNoise(whole.noise.measurement, index)),
-        prior.select(state),
-        whole.n_members,
-        len(index),
-        whole.dt * thinning,
-        whole.square_root,
-        whole.inflation,
-        None if localisation is None else localisation.select(state, index),
-        whole.weighting,
-        thinning * whole.thinning,
-        index if whole.columns is None else whole.columns[index],
-        None if names is None else tuple(names[i] for i in index.tolist()),
-    )
-    return part.train(whole.training)

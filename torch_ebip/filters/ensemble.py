@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -11,11 +9,13 @@ from torch import Tensor, nn
 
 from torch_ebip import functional
 from torch_ebip.draws import standard_normal
-from torch_ebip.filters.base import Filter, Forecast
 from torch_ebip.filters.evidence import Evidence, EvidenceWeighting
 from torch_ebip.filters.interaction import BasisProjection
 from torch_ebip.filters.localisation import Localisation
+from torch_ebip.filters.members import MemberFilter
+from torch_ebip.filters.priors import select_prior
 from torch_ebip.functional import Taper
+from torch_ebip.noise.pair import FilterNoise
 
 
 class EnsembleState(NamedTuple):
@@ -45,21 +45,7 @@ class EnsembleState(NamedTuple):
         return functional.ensemble_covariance(self.members, self.weights)
 
 
-class FilterNoise(nn.Module):
-    """The noise of a filter, Q and R.
-
-    Args:
-        process: maps members [..., E, n], dt [...] and a generator to members with noise added.
-        measurement: maps the mean phase [...] (or None) to standard deviations [D] or [..., D].
-    """
-
-    def __init__(self, process: nn.Module, measurement: nn.Module) -> None:
-        super().__init__()
-        self.process = process
-        self.measurement = measurement
-
-
-class EnsembleFilter(Filter):
+class EnsembleFilter(MemberFilter):
     """Ensemble Kalman filter, stochastic (the paper's) or square-root.
 
     Args:
@@ -105,23 +91,14 @@ class EnsembleFilter(Filter):
         columns: Tensor | None = None,
         dof_names: tuple[str, ...] | None = None,
     ) -> None:
-        super().__init__(dt, n_dofs)
-        if n_members < 2:
-            raise ValueError(f"an ensemble needs at least 2 members to have a spread, got {n_members}")
-        self.dynamics = dynamics
-        self.observation = observation
-        self.noise = noise
-        self.prior = prior
-        self.n_members = n_members
+        super().__init__(dynamics, observation, noise, prior, n_members, n_dofs, dt, thinning, dof_names)
         self.square_root = square_root
         self.inflation = inflation
         self.localisation = localisation
         self.weighting = weighting
-        self.thinning = thinning
         if weighting is not None and not isinstance(observation, BasisProjection):
             raise ValueError("evidence weights need demonstrations behind the members, and so a BasisProjection")
         self.register_buffer("columns", columns)
-        self.dof_names = dof_names
 
     def initial_state(
         self,
@@ -150,7 +127,7 @@ class EnsembleFilter(Filter):
         rows = None if bool(measured.all()) else measured.nonzero().squeeze(-1)
         members, weights, evidence = state.members, state.weights, state.evidence
         phase = self._phase_or_none(state)
-        deviation = self.noise.measurement(phase) / math.sqrt(self.thinning)
+        deviation = self._deviation(phase)
         taper = None if self.localisation is None else self.localisation()
         projections, origins = self._project_rows(state, rows)
         if rows is not None:
@@ -168,7 +145,7 @@ class EnsembleFilter(Filter):
                     members, projections, y, factor, draws, observed, taper, weights
                 )
         except functional.FactorisationError as error:
-            raise ValueError(f"{error}{self._names(error.dofs, rows)}") from error
+            raise self._named(error, rows) from error
         if self.inflation is not None:
             growth = torch.where(observed.any(-1), self._inflation_factor(members) ** self.thinning, 1)
             updated = functional.inflate(updated, growth, weights)
@@ -187,53 +164,35 @@ class EnsembleFilter(Filter):
         projections = self.observation(state.members)
         return projections if rows is None else projections[..., rows], None
 
-    def _names(self, dofs: list[int], rows: Tensor | None) -> str:
-        """The names of failing rows, in brackets, if there are any."""
-        if self.dof_names is None:
-            return ""
-        return f" ({', '.join(self.dof_names[i if rows is None else int(rows[i])] for i in dofs)})"
-
     def _inflation_factor(self, members: Tensor) -> Tensor:
         value = self.inflation.value if isinstance(self.inflation, nn.Module) else self.inflation
         return torch.as_tensor(value, dtype=members.dtype, device=members.device)
 
-    def project(self, state: EnsembleState) -> Tensor:
-        """See `Filter.project`."""
-        return functional.ensemble_mean(self.observation(state.members), state.weights)
+    def restrict(self, dofs: Tensor, thinning: int = 1) -> EnsembleFilter:
+        """See `Filter.restrict`."""
+        model = self._select(dofs, thinning)
+        localisation, columns = self.localisation, self.columns
+        part = EnsembleFilter(
+            model.dynamics,
+            model.observation,
+            model.noise,
+            select_prior(self.prior, model.state),
+            self.n_members,
+            model.n_dofs,
+            model.dt,
+            self.square_root,
+            self.inflation,
+            None if localisation is None else localisation.select(model.state, model.dofs),
+            self.weighting,
+            thinning * self.thinning,
+            model.dofs if columns is None else columns[model.dofs],
+            model.dof_names,
+        )
+        return part.train(self.training)
 
-    def phase(self, state: EnsembleState) -> Tensor:
-        """See `Filter.phase`."""
-        phase = self._phase_or_none(state)
-        return state.members[..., 0, 0] * torch.nan if phase is None else phase
+    def _leaves_span(self) -> str | None:
+        return "covariances are localised" if self.localisation is not None else super()._leaves_span()
 
-    def _phase_or_none(self, state: EnsembleState) -> Tensor | None:
-        phase_of: Callable[[Tensor], Tensor] | None = getattr(self.observation, "phase", None)
-        if phase_of is None:
-            return None
-        return functional.ensemble_mean(phase_of(state.members).unsqueeze(-1), state.weights).squeeze(-1)
-
-    def forecast_members(self, state: EnsembleState, phase: Tensor) -> Tensor:
-        """Each member's trajectory, [..., P, E, D], at phases [P] or [..., P].
-
-        Raises:
-            TypeError: the observation knows no phase.
-        """
-        project_at: Callable[[Tensor, Tensor], Tensor] | None = getattr(self.observation, "at", None)
-        if project_at is None:
-            raise TypeError(f"{type(self.observation).__name__} knows no phase to forecast along: it has no `at`")
-        batch = state.members.shape[:-2]
-        return project_at(state.members, phase.to(state.members).expand(*batch, -1))
-
-    def forecast(self, state: EnsembleState, phase: Tensor | None = None) -> Forecast:
-        """Steps 4 and 5: mean and variance over members of h at phases to come; see `Filter.forecast`.
-
-        At a given phase h is linear in the weights, so the mean of h is h of the mean, the paper's output.
-        """
-        if phase is None:
-            now = self.phase(state).clamp(0, 1).unsqueeze(-1)
-            phase = now + (1 - now) * torch.linspace(0, 1, 50, dtype=now.dtype, device=now.device)
-        members = self.forecast_members(state, phase)
-        phase = phase.to(members).expand(members.shape[:-2])
-        weights = None if state.weights is None else state.weights.unsqueeze(-2)
-        mean, variance = functional.ensemble_mean(members, weights), functional.ensemble_variance(members, weights)
-        return Forecast(mean, variance, phase)
+    def extra_repr(self) -> str:
+        """The options that are not modules."""
+        return f"n_members={self.n_members}, square_root={self.square_root}, thinning={self.thinning}"

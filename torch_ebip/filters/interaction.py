@@ -39,6 +39,12 @@ class ConstantVelocityPhase(nn.Module):
         phase = phase - excess * excess.abs() / (self.overrun + excess.abs())
         return torch.cat([phase, velocity, weights], dim=-1)
 
+    def slope(self, mean: Tensor, dt: Tensor) -> Tensor:
+        """Derivative [...] of the next phase by the present one at states [..., n]: 1 within the interval."""
+        phase = mean[..., 0] + mean[..., 1] * dt
+        excess = (phase - phase.clamp(0, 1)).abs()
+        return (1 + excess / self.overrun).pow(-2)
+
 
 class BasisProjection(nn.Module):
     """h(x): each member's weights through the basis at its own phase.

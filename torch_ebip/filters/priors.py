@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 
@@ -49,17 +51,92 @@ class DemonstrationPrior(nn.Module):
             shape = (*batch_shape, n_members)
             device = self.states.device if generator is None else generator.device
             members = torch.randint(count, shape, generator=generator, device=device).to(self.states.device)
-        if members.dtype != torch.int64 or members.ndim < 1:
-            raise ValueError(f"members must be int64 [..., E], got {members.dtype} {tuple(members.shape)}")
-        if members.numel() and (int(members.min()) < 0 or int(members.max()) >= count):
-            raise ValueError(
-                f"members must name demonstrations 0 to {count - 1}, got {int(members.min())} to {int(members.max())}"
-            )
+        check_members(members, count)
         return self.states[members.expand(*batch_shape, members.shape[-1]) if batch_shape else members]
 
     def select(self, columns: Tensor) -> DemonstrationPrior:
         """The prior of some entries of the state, int64 [k]."""
         return DemonstrationPrior(self.states[:, columns])
+
+
+class MomentPrior(nn.Module):
+    """Mean and covariance of the demonstrations' states: the paper's equations of mu_0 and Sigma_0.
+
+    "No initial correlations" between phase and weights, as in the paper; phases all start at 0, so of the block
+    Sigma_phi,phi only the variance of the phase velocities is left.
+
+    Args:
+        states: [N, n], one state a demonstration: phase 0, its phase velocity, its weights.
+        shrinkage: share of the diagonal in the covariance of the weights, (1 - s) C + s diag(C). The sample
+            covariance of N demonstrations has rank N - 1 at most; any s > 0 gives it full rank.
+
+    Raises:
+        ValueError: fewer than two states, or a shrinkage outside [0, 1].
+    """
+
+    states: Tensor
+
+    def __init__(self, states: Tensor, shrinkage: float = 0.0) -> None:
+        super().__init__()
+        if states.ndim != 2 or len(states) < 2:
+            raise ValueError(f"a prior needs at least 2 states [N, n], got {tuple(states.shape)}")
+        if not 0 <= shrinkage <= 1:
+            raise ValueError(f"shrinkage must lie between 0 and 1, got {shrinkage}")
+        self.register_buffer("states", states)
+        self.shrinkage = shrinkage
+
+    def forward(self, batch_shape: tuple[int, ...], members: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Mean [*batch_shape, n] and covariance [*batch_shape, n, n].
+
+        Args:
+            batch_shape: leading dimensions.
+            members: int64 [..., E], of which demonstrations; broadcast to the batch; default: all.
+
+        Raises:
+            ValueError: an index of a demonstration that there is not, or shapes that do not broadcast.
+        """
+        states = self.states
+        if members is not None:
+            check_members(members, len(states))
+            states = states[members.expand(*batch_shape, members.shape[-1]) if batch_shape else members]
+        mean = states.mean(-2)
+        anomalies = states - mean.unsqueeze(-2)
+        covariance = anomalies.transpose(-1, -2) @ anomalies / (states.shape[-2] - 1)
+        variance = covariance.diagonal(dim1=-2, dim2=-1)
+        keep = torch.full_like(covariance, 1 - self.shrinkage)
+        keep[..., :2, :] = 0
+        keep[..., :, :2] = 0
+        covariance = covariance * keep
+        covariance.diagonal(dim1=-2, dim2=-1).copy_(variance)
+        if members is None:
+            return mean.expand(*batch_shape, -1), covariance.expand(*batch_shape, -1, -1)
+        return mean, covariance
+
+    def select(self, columns: Tensor) -> MomentPrior:
+        """The prior of some entries of the state, int64 [k]."""
+        return MomentPrior(self.states[:, columns], self.shrinkage)
+
+
+def check_members(members: Tensor, count: int) -> None:
+    """ValueError unless members are int64 [..., E], indices of ``count`` demonstrations."""
+    if members.dtype != torch.int64 or members.ndim < 1:
+        raise ValueError(f"members must be int64 [..., E], got {members.dtype} {tuple(members.shape)}")
+    if members.numel() and (int(members.min()) < 0 or int(members.max()) >= count):
+        raise ValueError(
+            f"members must name demonstrations 0 to {count - 1}, got {int(members.min())} to {int(members.max())}"
+        )
+
+
+def select_prior(prior: nn.Module, columns: Tensor) -> nn.Module:
+    """The prior of some entries of the state, int64 [k].
+
+    Raises:
+        TypeError: a prior that has no ``select``.
+    """
+    select: Callable[[Tensor], nn.Module] | None = getattr(prior, "select", None)
+    if select is None:
+        raise TypeError(f"a {type(prior).__name__} cannot be restricted to some DoFs")
+    return select(columns)
 
 
 class GaussianPrior(nn.Module):

@@ -2,11 +2,13 @@
 
 from torch_ebip.noise.constraints import AboveOne, Constrained, Positive
 from torch_ebip.noise.measurement import MeasurementNoise
+from torch_ebip.noise.pair import FilterNoise
 from torch_ebip.noise.process import InteractionNoise, NoProcessNoise, PhaseNoise, WeightNoise
 
 __all__ = [
     "AboveOne",
     "Constrained",
+    "FilterNoise",
     "InteractionNoise",
     "MeasurementNoise",
     "NoProcessNoise",

@@ -110,13 +110,28 @@ class InteractionNoise(nn.Module):
         columns = columns if self.columns is None else self.columns[columns]
         return InteractionNoise(self.phase, self.weights, columns, thinning * self.thinning)
 
+    def covariance(self, dt: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Q for steps dt [...] seconds, which has two blocks.
+
+        Returns:
+            The covariance of phase and phase velocity, [..., 2, 2], and the variances of the other entries,
+            [..., n_weights]; None where they have no noise.
+        """
+        weights = self._weight_scale(dt)
+        return self.phase.covariance(dt) / self.thinning, None if weights is None else weights.square()
+
+    def _weight_scale(self, dt: Tensor) -> Tensor | None:
+        if self.weights is None:
+            return None
+        scale = self.weights.scale(dt)
+        return scale if self.columns is None else scale[..., self.columns]
+
     def forward(self, members: Tensor, dt: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Members [..., E, n] with noise for steps dt [...] seconds added."""
         phase, weights = members.tensor_split((2,), dim=-1)
         factor = self.phase.cholesky(dt).transpose(-1, -2) / math.sqrt(self.thinning)
         phase = phase + standard_normal(phase.shape, phase, generator) @ factor
-        if self.weights is not None:
-            scale = self.weights.scale(dt)
-            scale = scale if self.columns is None else scale[..., self.columns]
+        scale = self._weight_scale(dt)
+        if scale is not None:
             weights = weights + standard_normal(weights.shape, weights, generator) * scale.unsqueeze(-2)
         return torch.cat([phase, weights], dim=-1)

@@ -1,4 +1,4 @@
-"""Tuning the noise of an ensemble filter by gradient, on top of the closed form.
+"""Tuning the noise of a filter by gradient, on top of the closed form.
 
 Every training interaction is filtered by an ensemble that does not contain it, shown a random subset of its
 sensors up to random horizons, and the forecasts made there are scored. Everything random in a step follows from
@@ -21,9 +21,7 @@ from torch import Tensor, nn
 
 from torch_ebip.checkpoint import load_checkpoint, save_checkpoint
 from torch_ebip.demonstrations import Demonstrations
-from torch_ebip.filters.base import Trace
-from torch_ebip.filters.ebip import restrict
-from torch_ebip.filters.ensemble import EnsembleFilter
+from torch_ebip.filters.base import Filter, Trace
 from torch_ebip.monitor import Monitor
 from torch_ebip.objective import ForecastObjective
 from torch_ebip.primitive import InteractionPrimitive
@@ -31,10 +29,10 @@ from torch_ebip.tuning.settings import TuningResult, TuningSettings
 
 
 class Tuner:
-    """Tunes a filter made by `ebip` on the demonstrations that it is made of.
+    """Tunes a filter on the demonstrations that it is made of.
 
     Args:
-        filter: changed in place; its prior's states are those of ``primitive``.
+        filter: made by `ebip`, `bip` and the like, changed in place; its prior's states are those of ``primitive``.
         demonstrations: N of them, what ``primitive`` was fitted to.
         primitive: for the targets.
         objective: what is minimised.
@@ -52,7 +50,7 @@ class Tuner:
 
     def __init__(
         self,
-        filter: EnsembleFilter,
+        filter: Filter,
         demonstrations: Demonstrations,
         primitive: InteractionPrimitive,
         objective: ForecastObjective,
@@ -141,13 +139,13 @@ class Tuner:
 
     def _filter(
         self, interactions: Tensor, subset: Tensor, shares: Tensor, generator: torch.Generator
-    ) -> tuple[EnsembleFilter, Trace, tuple[Any, ...]]:
+    ) -> tuple[Filter, Trace, tuple[Any, ...]]:
         """Filter some interactions [B], shown a subset [D] of sensors, up to shares [B, K] of their length."""
         kept_dofs = subset | self.targets
         stride, device = self.settings.thinning, self.lengths.device
         members = self._members(interactions, generator).to(device)
         interactions, shares = interactions.to(device), shares.to(device)
-        part = restrict(self.filter, kept_dofs, stride)
+        part = self.filter.restrict(kept_dofs, stride)
         last = (self.lengths[interactions] - 1).unsqueeze(-1)
         steps = torch.minimum((shares * last / stride).round().long(), last // stride)
         length = int(steps.max()) + 1
@@ -252,7 +250,7 @@ class Tuner:
             "parameters": list(shapes),
             "samples": interactions,
             "masks": masks,
-            "square_root": self.filter.square_root,
+            "filter": f"{type(self.filter).__name__}({self.filter.extra_repr()})",
             "objective_weights": list(self.objective.weights),
             "filter_buffers": _fingerprint(self.filter),
             "objective_buffers": _fingerprint(self.objective),

@@ -1,0 +1,97 @@
+"""What filters have in common whose belief is a set of members, weighted or not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+from torch_ebip import functional
+from torch_ebip.filters.base import Filter
+from torch_ebip.filters.forecast import Forecast
+from torch_ebip.filters.sequence import State
+from torch_ebip.noise.pair import FilterNoise
+
+
+class MemberFilter(Filter):
+    """Means, phases and forecasts of members; a subclass says how they are predicted and updated.
+
+    Its states have ``members`` [..., E, n] and ``weights`` [..., E], None where all members count alike.
+
+    Args:
+        dynamics: g, maps members [..., E, n] and dt [...] to members.
+        observation: h, maps members [..., E, n] to projections [..., E, D]. If it has ``phase(members)`` and
+            ``at(members, phase)``, as `BasisProjection` has, the filter knows phases and can forecast.
+        noise: Q and R.
+        prior: maps (batch_shape, n_members, members, generator) to initial members.
+        n_members: E.
+        n_dofs, dt, thinning, dof_names: see `Filter`.
+
+    Raises:
+        ValueError: fewer than two members.
+    """
+
+    fair = True
+    """Whether members are draws of equal standing: variances and scores are then corrected for their number."""
+
+    def __init__(
+        self,
+        dynamics: nn.Module,
+        observation: nn.Module,
+        noise: FilterNoise,
+        prior: nn.Module,
+        n_members: int,
+        n_dofs: int,
+        dt: float,
+        thinning: int = 1,
+        dof_names: tuple[str, ...] | None = None,
+    ) -> None:
+        super().__init__(dynamics, observation, noise, prior, n_dofs, dt, thinning, dof_names)
+        if n_members < 2:
+            raise ValueError(f"an ensemble needs at least 2 members to have a spread, got {n_members}")
+        self.n_members = n_members
+
+    def project(self, state: State) -> Tensor:
+        """See `Filter.project`."""
+        return functional.ensemble_mean(self.observation(state.members), state.weights)
+
+    def phase(self, state: State) -> Tensor:
+        """See `Filter.phase`."""
+        phase = self._phase_or_none(state)
+        if phase is not None:
+            return phase
+        members: Tensor = state.members
+        return members[..., 0, 0] * torch.nan
+
+    def _phase_or_none(self, state: State) -> Tensor | None:
+        phase_of: Callable[[Tensor], Tensor] | None = getattr(self.observation, "phase", None)
+        if phase_of is None:
+            return None
+        return functional.ensemble_mean(phase_of(state.members).unsqueeze(-1), state.weights).squeeze(-1)
+
+    def forecast_members(self, state: State, phase: Tensor) -> Tensor:
+        """Each member's trajectory, [..., P, E, D], at phases [P] or [..., P].
+
+        Raises:
+            TypeError: the observation knows no phase.
+        """
+        project_at: Callable[[Tensor, Tensor], Tensor] | None = getattr(self.observation, "at", None)
+        if project_at is None:
+            raise TypeError(f"{type(self.observation).__name__} knows no phase to forecast along: it has no `at`")
+        batch = state.members.shape[:-2]
+        return project_at(state.members, phase.to(state.members).expand(*batch, -1))
+
+    def forecast(self, state: State, phase: Tensor | None = None) -> Forecast:
+        """Steps 4 and 5 of the paper's box: mean and variance over members of h at phases to come.
+
+        At a given phase h is linear in the weights, so the mean of h is h of the mean, the paper's output.
+        See `Filter.forecast`.
+        """
+        phase = self._phases_ahead(state) if phase is None else phase
+        members = self.forecast_members(state, phase)
+        phase = phase.to(members).expand(members.shape[:-2])
+        weights = None if state.weights is None else state.weights.unsqueeze(-2).expand(members.shape[:-1])
+        mean = functional.ensemble_mean(members, weights)
+        variance = functional.ensemble_variance(members, weights, self.fair)
+        return Forecast(mean, variance, phase, members, weights, self.fair)

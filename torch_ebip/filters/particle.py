@@ -1,0 +1,214 @@
+"""The particle filter the paper compares with: demonstrations that are weighted, never shifted."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torch_ebip import functional
+from torch_ebip.basis.base import Basis
+from torch_ebip.filters.interaction import BasisProjection
+from torch_ebip.filters.members import MemberFilter
+from torch_ebip.filters.model import demonstration_states, interaction_model
+from torch_ebip.filters.priors import DemonstrationPrior, select_prior
+from torch_ebip.noise.pair import FilterNoise
+from torch_ebip.primitive import InteractionPrimitive
+
+
+class ParticleState(NamedTuple):
+    """Weighted particles.
+
+    Attributes:
+        members: [..., E, n].
+        log_weights: [..., E], normalised.
+    """
+
+    members: Tensor
+    log_weights: Tensor
+
+    @property
+    def weights(self) -> Tensor:
+        """[..., E], summing to 1."""
+        return self.log_weights.exp()
+
+    @property
+    def mean(self) -> Tensor:
+        """[..., n]."""
+        return functional.ensemble_mean(self.members, self.weights)
+
+    @property
+    def covariance(self) -> Tensor:
+        """[..., n, n], sum_j w_j (x_j - mean)(x_j - mean)'."""
+        return functional.ensemble_covariance(self.members, self.weights, unbiased=False)
+
+    @property
+    def effective_size(self) -> Tensor:
+        """[...], 1 / sum_j w_j^2: E for equal weights, 1 where one particle has it all."""
+        return torch.exp(-torch.logsumexp(2 * self.log_weights, dim=-1))
+
+
+class ParticleFilter(MemberFilter):
+    """Bootstrap particle filter with systematic resampling (Doucet & Johansen 2009, algorithm of section 3.5).
+
+    Particles whose weights have an effective size below ``threshold`` E are resampled at the beginning of the
+    next prediction, so that the estimates after an update do not suffer from it. Where a batch entry does not
+    need it, its particles stay as they are.
+
+    Args:
+        dynamics, observation, noise, prior, n_members, n_dofs, dt, dof_names: see `MemberFilter`.
+        threshold: share of E below which particles are resampled; the paper's 1/2.
+        softness: resample from (1 - softness) w + softness / E, and weigh by the ratio (soft resampling, Karkus,
+            Hsu & Lee 2018): with it, gradients pass through resampling. 0 resamples from w, without gradient.
+        thinning: see `Filter.restrict`.
+
+    Raises:
+        ValueError: fewer than two particles, a threshold outside [0, 1] or a softness outside [0, 1).
+    """
+
+    fair = False
+
+    def __init__(
+        self,
+        dynamics: nn.Module,
+        observation: nn.Module,
+        noise: FilterNoise,
+        prior: nn.Module,
+        n_members: int,
+        n_dofs: int,
+        dt: float,
+        threshold: float = 0.5,
+        softness: float = 0.0,
+        thinning: int = 1,
+        dof_names: tuple[str, ...] | None = None,
+    ) -> None:
+        super().__init__(dynamics, observation, noise, prior, n_members, n_dofs, dt, thinning, dof_names)
+        if not 0 <= threshold <= 1:
+            raise ValueError(f"threshold must lie between 0 and 1, got {threshold}")
+        if not 0 <= softness < 1:
+            raise ValueError(f"softness must be at least 0 and below 1, got {softness}")
+        self.threshold = threshold
+        self.softness = softness
+
+    def initial_state(
+        self,
+        batch_shape: tuple[int, ...] = (),
+        members: Tensor | None = None,
+        generator: torch.Generator | None = None,
+    ) -> ParticleState:
+        """See `Filter.initial_state`."""
+        started: Tensor = self.prior(batch_shape, self.n_members, members, generator)
+        count = started.shape[-2]
+        return ParticleState(started, started.new_full(started.shape[:-1], -math.log(count)))
+
+    def _predict(self, state: ParticleState, dt: Tensor, generator: torch.Generator | None) -> ParticleState:
+        """Resample where it is needed, then x = g(x) + N(0, Q)."""
+        state = self._resample(state, generator)
+        members = self.noise.process(self.dynamics(state.members, dt), dt, generator)
+        return ParticleState(members, state.log_weights)
+
+    def _resample(self, state: ParticleState, generator: torch.Generator | None) -> ParticleState:
+        batch, count = state.log_weights.shape[:-1], state.log_weights.shape[-1]
+        device = state.members.device if generator is None else generator.device
+        # Drawn whether it is needed or not, so that later draws do not depend on the measurements.
+        u = torch.rand(batch, dtype=state.members.dtype, generator=generator, device=device).to(state.members.device)
+        needed = state.effective_size < self.threshold * count
+        if not bool(needed.any()):
+            return state
+        proposal, ratio = state.log_weights, torch.zeros_like(state.log_weights)
+        if self.softness:
+            uniform = torch.full_like(proposal, math.log(self.softness / count))
+            proposal = torch.logaddexp(proposal + math.log1p(-self.softness), uniform)
+            ratio = state.log_weights - proposal
+        ancestors = functional.systematic_resample(proposal.detach(), u)
+        ancestors = torch.where(needed.unsqueeze(-1), ancestors, torch.arange(count, device=u.device))
+        members = state.members.gather(-2, ancestors.unsqueeze(-1).expand(state.members.shape))
+        resampled = torch.log_softmax(ratio.gather(-1, ancestors), dim=-1)
+        return ParticleState(members, torch.where(needed.unsqueeze(-1), resampled, state.log_weights))
+
+    def _update(
+        self, state: ParticleState, y: Tensor, observed: Tensor, generator: torch.Generator | None
+    ) -> tuple[ParticleState, Tensor]:
+        """w = w N(y; h(x), R), over the DoFs that were measured."""
+        measured = observed.reshape(-1, self.n_dofs).any(0)
+        if not bool(measured.any()):
+            return state, state.members.new_zeros(observed.shape[:-1])
+        rows = measured.nonzero().squeeze(-1)
+        deviation = self._deviation(self._phase_or_none(state))[..., rows]
+        y, observed = y[..., rows], observed[..., rows]
+        projections = self._project_rows(state.members, rows)
+        z = (torch.where(observed, y, 0).unsqueeze(-2) - projections) / deviation.unsqueeze(-2)
+        terms = torch.where(observed.unsqueeze(-2), z.square(), 0).sum(-1)
+        constant = torch.where(observed, 2 * deviation.log() + math.log(2 * math.pi), 0).sum(-1, keepdim=True)
+        joint = state.log_weights - 0.5 * (terms + constant)
+        likelihood = torch.logsumexp(joint, dim=-1)
+        any_observed = observed.any(-1)
+        weights = torch.where(any_observed.unsqueeze(-1), joint - likelihood.unsqueeze(-1), state.log_weights)
+        return ParticleState(state.members, weights), torch.where(any_observed, likelihood, 0)
+
+    def _project_rows(self, members: Tensor, rows: Tensor) -> Tensor:
+        if isinstance(self.observation, BasisProjection):
+            return self.observation.rows(members, rows.tolist())[0]
+        projections: Tensor = self.observation(members)
+        return projections[..., rows]
+
+    def restrict(self, dofs: Tensor, thinning: int = 1) -> ParticleFilter:
+        """See `Filter.restrict`."""
+        model = self._select(dofs, thinning)
+        part = ParticleFilter(
+            model.dynamics,
+            model.observation,
+            model.noise,
+            select_prior(self.prior, model.state),
+            self.n_members,
+            model.n_dofs,
+            model.dt,
+            self.threshold,
+            self.softness,
+            thinning * self.thinning,
+            model.dof_names,
+        )
+        return part.train(self.training)
+
+    def extra_repr(self) -> str:
+        """The options that are not modules."""
+        return (
+            f"n_members={self.n_members}, threshold={self.threshold}, softness={self.softness}, "
+            f"thinning={self.thinning}"
+        )
+
+
+def particle_filter(
+    primitive: InteractionPrimitive,
+    n_members: int | None = None,
+    *,
+    residual_variance: Tensor | None = None,
+    weight_noise: float | None = None,
+    context: Basis | None = None,
+    softness: float = 0.0,
+) -> ParticleFilter:
+    """The paper's PF: particles are demonstrations, systematic resampling where N_eff < E/2.
+
+    Args:
+        primitive: of the demonstrations.
+        n_members: E; default: N, each demonstration once. Otherwise they are drawn with replacement.
+        residual_variance, weight_noise, context: see `interaction_model`.
+        softness: of the resampling, see `ParticleFilter`; needed for gradients through it.
+
+    Returns:
+        A filter with parameters of its own, in the dtype and on the device of the primitive.
+    """
+    model = interaction_model(primitive, residual_variance, weight_noise, context)
+    return ParticleFilter(
+        model.dynamics,
+        model.observation,
+        model.noise,
+        DemonstrationPrior(demonstration_states(primitive)),
+        len(primitive) if n_members is None else n_members,
+        model.n_dofs,
+        model.dt,
+        softness=softness,
+        dof_names=model.dof_names,
+    )

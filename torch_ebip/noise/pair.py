@@ -1,0 +1,19 @@
+"""The two noises of a filter, together."""
+
+from __future__ import annotations
+
+from torch import nn
+
+
+class FilterNoise(nn.Module):
+    """The noise of a filter, Q and R.
+
+    Args:
+        process: maps members [..., E, n], dt [...] and a generator to members with noise added.
+        measurement: maps the mean phase [...] (or None) to standard deviations [D] or [..., D].
+    """
+
+    def __init__(self, process: nn.Module, measurement: nn.Module) -> None:
+        super().__init__()
+        self.process = process
+        self.measurement = measurement
