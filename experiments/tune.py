@@ -9,33 +9,26 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
-import os
 import time
-from collections.abc import Callable, Mapping
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
 from tqdm import tqdm
 
-from experiments.evaluate import FilterMethod, MeanMethod, NearestMethod, Task, evaluate
+from experiments.data import FRACTIONS, load, thinning
+from experiments.evaluate import FilterMethod, MeanMethod, NearestMethod, evaluate
 from experiments.figures import forecast_figure, noise_figure, results_figure
+from experiments.folds import mean_of_cells, read_values, run_folds, share_cores, split, write_values
 from experiments.methods import FACTORS, Problem, best_factor, scaled, tunable, tune
-from experiments.results import Cell, Values, print_tables, summarise
+from experiments.results import Values, print_tables, summarise
 from experiments.run_folder import RunFolder, write_json
-from torch_ebip import Demonstrations, InteractionPrimitive, select_basis
+from torch_ebip import InteractionPrimitive, select_basis
 from torch_ebip.basis import rank_candidates, selection_table
 from torch_ebip.checkpoint import save_checkpoint
 from torch_ebip.monitor import Monitor
 from torch_ebip.tuning import TuningSettings
-
-FRACTIONS = (0.43, 0.82)
-SAMPLES = 25
-"""How many samples of an interaction are used while tuning."""
 
 
 @dataclass(frozen=True)
@@ -54,49 +47,16 @@ class Job:
     tuning: TuningSettings
 
 
-def load(data: str | None, count: int, seed: int) -> tuple[Demonstrations, Task]:
-    """Recordings and what is asked of them."""
-    if count < 1:
-        raise SystemExit(f"--demonstrations must be at least 1, got {count}")
-    if data is not None:
-        try:
-            demonstrations = Demonstrations.load(data)
-        except (ValueError, OSError) as error:
-            raise SystemExit(str(error)) from error
-        layout = demonstrations.layout
-        sensors = [modality.name for modality in layout.modalities if not modality.controlled]
-        targets = [modality.name for modality in layout.modalities if modality.controlled]
-        if not sensors or not targets:
-            raise SystemExit(f"{data}: needs observed and controlled modalities, has {', '.join(layout.names)}")
-        return demonstrations, Task({"all": sensors}, FRACTIONS, [], targets, {}, None)
-    from experiments.ball_catching import SUBSETS, load_or_generate, teacher
-
-    task = Task(
-        SUBSETS, FRACTIONS, [("ball", FRACTIONS[0])], ["robot", "ball"], {"robot": 3}, (teacher.arm(), "robot")
-    )
-    return load_or_generate(count, seed), task
-
-
-def split(job: Job, count: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Training and test indices of a fold; with one fold, a share of the shuffled demonstrations is the test."""
-    order = torch.randperm(count, generator=torch.Generator().manual_seed(job.seed))
-    if job.folds == 1:
-        held = round(job.test * count)
-        return order[held:], order[:held]
-    parts = order.tensor_split(job.folds)
-    return torch.cat([part for i, part in enumerate(parts) if i != job.fold]), parts[job.fold]
-
-
 def run_fold(job: Job, progress: Callable[[int, float, float], None] | None = None) -> Values:
     """Fit, scan, tune and evaluate one fold; a finished one is read from its folder."""
     torch.set_num_threads(job.threads)
     folder = Path(job.folder)
     finished = folder / "values.json"
     if finished.exists():
-        return _read_values(finished)
+        return read_values(finished)
     demonstrations, task = load(job.data, job.demonstrations, job.seed)
     layout = demonstrations.layout
-    training, testing = split(job, len(demonstrations))
+    training, testing = split(len(demonstrations), job.folds, job.fold, job.seed, job.test)
     known, tests = demonstrations.subset(training), demonstrations.subset(testing)
     ranking = rank_candidates(known)
     basis = select_basis(known, ranking=ranking)
@@ -149,7 +109,7 @@ def run_fold(job: Job, progress: Callable[[int, float, float], None] | None = No
         {"start": start},
         {"parameters": {name: p.detach() for name, p in tuned.named_parameters()}},
     )
-    _write_values(finished, answers)
+    write_values(finished, answers)
     return answers
 
 
@@ -163,8 +123,7 @@ def main(arguments: list[str] | None = None) -> None:
         tuning = replace(tuning, steps=min(options.steps, 20), batch_size=8, validate_every=5)
         count, scan = min(count, 100), 12
     demonstrations, task = load(options.data, count, options.seed)
-    # Neighbouring samples say nearly the same, and a sample that stands for k costs a k-th.
-    tuning = replace(tuning, thinning=max(1, round(float(demonstrations.lengths.double().median()) / SAMPLES)))
+    tuning = replace(tuning, thinning=thinning(demonstrations))
     settings = {
         "data": options.data,
         "demonstrations": None if options.data else count,
@@ -185,8 +144,7 @@ def main(arguments: list[str] | None = None) -> None:
             f"others by the rest in {tuning.folds} folds, and needs {2 * tuning.folds} of them"
         )
     run = RunFolder("tune", settings, options.out, options.force)
-    workers = max(1, min(options.workers or os.cpu_count() or 1, options.folds))
-    threads = max(1, (os.cpu_count() or 1) // workers)
+    workers, threads = share_cores(options.folds, options.workers)
     jobs = [
         Job(fold, options.folds, options.data, count, options.seed, test, scan, threads,
             str(run.path / f"fold-{fold:02d}" if options.folds > 1 else run.path), tuning)
@@ -194,7 +152,7 @@ def main(arguments: list[str] | None = None) -> None:
     ]  # fmt: skip
     print(demonstrations)
     try:
-        values = _single(jobs[0]) if len(jobs) == 1 else _folds(jobs, workers)
+        values = _single(jobs[0]) if len(jobs) == 1 else run_folds(run_fold, jobs, workers, _headline)
     except ValueError as error:
         raise SystemExit(f"{run.path}: {error}") from error
     results = {
@@ -233,54 +191,9 @@ def _single(job: Job) -> Values:
         return run_fold(job, show)
 
 
-def _folds(jobs: list[Job], workers: int) -> Values:
-    """Folds in processes of their own; what is finished is kept if the run is interrupted."""
-    merged: list[Values] = [{} for _ in jobs]
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        futures = {pool.submit(run_fold, job): job.fold for job in jobs}
-        with tqdm(total=len(jobs), desc="folds", unit="fold", dynamic_ncols=True) as bar:
-            for future in as_completed(futures):
-                merged[futures[future]] = future.result()
-                bar.set_postfix_str(_headline([values for values in merged if values]), refresh=False)
-                bar.update()
-    return _merge(merged)
-
-
-def _merge(parts: list[Values]) -> Values:
-    return {
-        cell: {name: np.concatenate([part[cell][name] for part in parts]) for name in methods}
-        for cell, methods in parts[0].items()
-    }
-
-
-def _headline(parts: list[Values]) -> str:
-    """Mean absolute error of the first target so far, tuned against scaled."""
-    merged = _merge(parts)
-    cells = [cell for cell in merged if cell.metric == "mae"]
-    pairs = (
-        (name, np.mean([np.nanmean(merged[cell][name]) for cell in cells])) for name in ("ebip_scaled", "ebip_tuned")
-    )
+def _headline(values: Values) -> str:
+    pairs = ((name, mean_of_cells(values, name, "mae")) for name in ("ebip_scaled", "ebip_tuned"))
     return ", ".join(f"{name} mae {mean:.4f}" for name, mean in pairs)
-
-
-def _write_values(path: Path, values: Values) -> None:
-    content: list[Mapping[str, Any]] = [
-        {
-            **cell._asdict(),
-            "values": {name: [None if np.isnan(v) else v for v in array.tolist()] for name, array in methods.items()},
-        }
-        for cell, methods in values.items()
-    ]
-    write_json(path, content)
-
-
-def _read_values(path: Path) -> Values:
-    values: Values = {}
-    for entry in json.loads(path.read_text()):
-        arrays = {name: np.array(v, dtype=np.float64) for name, v in entry.pop("values").items()}
-        values[Cell(**entry)] = arrays
-    return values
 
 
 def _parser() -> argparse.ArgumentParser:

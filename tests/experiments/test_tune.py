@@ -1,6 +1,5 @@
 """The main job at a small size, through its command line: what it writes, resumes, refuses."""
 
-import dataclasses
 import json
 import os
 import signal
@@ -14,7 +13,9 @@ import pytest
 import torch
 
 from experiments import tune
+from experiments.data import load
 from experiments.evaluate import FilterMethod, MeanMethod, NearestMethod, Task, evaluate
+from experiments.folds import split
 from experiments.methods import Problem, best_factor, restore, scaled, tunable
 from tests.conftest import interactions, small_primitive
 from torch_ebip import BSplineBasis, Demonstrations, InteractionPrimitive, Layout, Modality, select_basis
@@ -56,8 +57,7 @@ def test_a_finished_run_stops(finished: Path, recordings: str) -> None:
 
 def test_the_tuned_filter_can_be_restored(finished: Path, recordings: str) -> None:
     demonstrations = Demonstrations.load(recordings)
-    job = tune.Job(0, 1, recordings, 0, 5, 0.2, 4, 1, "", tune.TuningSettings())
-    training, testing = tune.split(job, 30)
+    training, testing = split(30, 1, 0, 5)
     primitive = InteractionPrimitive.fit(demonstrations.subset(training))
     method = FilterMethod(restore(finished, primitive), 5)
     task = Task({"all": ["hand", "gaze"]}, (0.43, 0.82), [], ["arm"], {}, None)
@@ -98,16 +98,14 @@ def test_a_killed_run_resumes_to_the_same_table(recordings: str, tmp_path: Path)
     assert all(row["n"] == 30 for row in whole["rows"])
 
 
-def test_test_interactions_are_seen_by_nobody(recordings: str) -> None:
-    jobs = [tune.Job(fold, 5, recordings, 0, 3, 0.2, 4, 1, "", tune.TuningSettings()) for fold in range(5)]
+def test_test_interactions_are_seen_by_nobody() -> None:
     tests = []
-    for job in jobs:
-        training, testing = tune.split(job, 31)
+    for fold in range(5):
+        training, testing = split(31, 5, fold, 3)
         assert not set(training.tolist()) & set(testing.tolist())
         tests += testing.tolist()
     assert sorted(tests) == list(range(31))
-    held = tune.split(dataclasses.replace(jobs[0], folds=1), 30)
-    assert len(held[1]) == 6
+    assert len(split(30, 1, 0, 3)[1]) == 6
 
 
 def test_a_target_is_never_shown(recordings: str) -> None:
@@ -155,7 +153,7 @@ def test_the_best_factor_does_not_wander_when_asked_again(tmp_path: Path) -> Non
 
 
 def test_the_simulated_task_has_the_papers_nine_cells() -> None:
-    demonstrations, task = tune.load(None, 16, 0)
+    demonstrations, task = load(None, 16, 0)
     primitive = InteractionPrimitive.fit(
         demonstrations.subset(range(12)), select_basis(demonstrations, [BSplineBasis(8)])
     )
@@ -194,7 +192,7 @@ def test_the_simulated_task_has_the_papers_nine_cells() -> None:
 
 
 def test_tuning_through_the_arm_reaches_the_noise() -> None:
-    demonstrations, task = tune.load(None, 16, 0)
+    demonstrations, task = load(None, 16, 0)
     primitive = InteractionPrimitive.fit(demonstrations, select_basis(demonstrations, [BSplineBasis(8)]))
     layout = demonstrations.layout
     subsets = {name: layout.mask(names) for name, names in task.subsets.items()}

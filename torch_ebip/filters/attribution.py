@@ -39,5 +39,5 @@ def affine_coefficients(demonstrations: Tensor, weights: Tensor) -> Tensor:
         raise ValueError(
             f"weights lie outside the span of the demonstrations by {float(outside):.2g} of their standard deviations"
         )
-    coefficients = coefficients + 1 / len(demonstrations)
-    return coefficients.to(weights.dtype)
+    result: Tensor = coefficients + 1 / len(demonstrations)
+    return result.to(weights.dtype)

@@ -1,0 +1,96 @@
+"""Cross-validation: splits, one process a fold, finished folds kept on disk, values of all folds put together."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from experiments.results import Cell, Values
+from experiments.run_folder import write_json
+
+Job = TypeVar("Job")
+
+
+def split(count: int, folds: int, fold: int, seed: int, test: float = 0.2) -> tuple[torch.Tensor, torch.Tensor]:
+    """Training and test indices of a fold; with one fold, a share ``test`` of the shuffled demonstrations."""
+    order = torch.randperm(count, generator=torch.Generator().manual_seed(seed))
+    if folds == 1:
+        held = round(test * count)
+        return order[held:], order[:held]
+    parts = order.tensor_split(folds)
+    return torch.cat([part for i, part in enumerate(parts) if i != fold]), parts[fold]
+
+
+def share_cores(folds: int, workers: int | None) -> tuple[int, int]:
+    """Processes for the folds, one a core unless told otherwise, and threads for each."""
+    cores = os.cpu_count() or 1
+    processes = max(1, min(workers or cores, folds))
+    return processes, max(1, cores // processes)
+
+
+def run_folds(
+    run: Callable[[Job], Values], jobs: Sequence[Job], workers: int, headline: Callable[[Values], str]
+) -> Values:
+    """Folds in processes of their own; what is finished is kept if the run is interrupted.
+
+    Args:
+        run: one fold; a function of a module, so that a new process can import it.
+        jobs: one a fold.
+        workers: processes.
+        headline: what the progress bar says of the values so far.
+    """
+    parts: list[Values] = [{} for _ in jobs]
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=context) as pool:
+        futures = {pool.submit(run, job): i for i, job in enumerate(jobs)}
+        with tqdm(total=len(jobs), desc="folds", unit="fold", dynamic_ncols=True) as bar:
+            try:
+                for future in as_completed(futures):
+                    parts[futures[future]] = future.result()
+                    bar.set_postfix_str(headline(merge([part for part in parts if part])), refresh=False)
+                    bar.update()
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+    return merge(parts)
+
+
+def merge(parts: Sequence[Values]) -> Values:
+    """Values of all interactions, in the order of the parts."""
+    return {
+        cell: {name: np.concatenate([part[cell][name] for part in parts]) for name in methods}
+        for cell, methods in parts[0].items()
+    }
+
+
+def mean_of_cells(values: Values, method: str, metric: str) -> float:
+    """Mean over cells and interactions of one metric of one method."""
+    cells = [methods[method] for cell, methods in values.items() if cell.metric == metric and method in methods]
+    return float(np.mean([np.nanmean(array) for array in cells])) if cells else float("nan")
+
+
+def write_values(path: Path, values: Values) -> None:
+    """Values of a finished fold as JSON, atomically."""
+    content: list[Mapping[str, Any]] = [
+        {**cell._asdict(), "values": {name: array.tolist() for name, array in methods.items()}}
+        for cell, methods in values.items()
+    ]
+    write_json(path, content)
+
+
+def read_values(path: Path) -> Values:
+    """What `write_values` wrote."""
+    values: Values = {}
+    for entry in json.loads(path.read_text()):
+        arrays = {name: np.array(v, dtype=np.float64) for name, v in entry.pop("values").items()}
+        values[Cell(**entry)] = arrays
+    return values
