@@ -69,8 +69,7 @@ class FilterMethod:
         trace = part(y[..., used], observed[..., used], generator=generator, keep=keep, project=False)
         assert trace.kept is not None
         forecast = part.forecast(trace.kept, y.new_ones(1)).select(dofs[used])
-        fields = (None if field is None else field[:, :, 0] for field in forecast[:5])
-        return Answer(Forecast(*fields, forecast.fair), part.phase(trace.kept))
+        return Answer(forecast.at(0), part.phase(trace.kept))
 
 
 class MeanMethod:
@@ -122,7 +121,7 @@ def evaluate(task: Task, methods: Mapping[str, Method], tests: Demonstrations) -
     lengths = tests.lengths
     layout = tests.layout
     targets = layout.mask(task.targets)
-    truth = torch.stack([_last_measured(trajectory) for trajectory in tests])
+    truth = torch.stack([last_measured(trajectory) for trajectory in tests])
     steps = torch.stack([(lengths * fraction).round().long() - 1 for fraction in task.fractions], -1).clamp(min=0)
     length = int(steps.max()) + 1
     within = torch.arange(length).view(1, -1, 1) <= steps.amax(-1).view(-1, 1, 1)
@@ -157,7 +156,7 @@ def _metrics(
         part = layout.slice(modality)
         columns = [order.index(dof) for dof in range(part.start, part.stop)]
         target = truth[:, part]
-        forecast = _at(answer.forecast, k).select(torch.tensor(columns))
+        forecast = answer.forecast.at(k).select(torch.tensor(columns))
         unit = layout[modality].unit
         lead = torch.arange(task.leading.get(modality, len(columns)))
         squares = measure.mse(forecast.select(lead), target[:, lead])
@@ -171,7 +170,7 @@ def _metrics(
         arm, modality = task.arm
         part = layout.slice(modality)
         columns = [order.index(dof) for dof in range(part.start, part.stop)]
-        distance = measure.tool_error(arm, answer.forecast.mean[:, k][..., columns], truth[:, part])
+        distance = measure.tool_error(arm, answer.forecast.at(k).mean[..., columns], truth[:, part])
         found.append((Cell(subset, fraction, "tool_error", None, "m"), distance))
     if not answer.phase.isnan().any():
         found.append(
@@ -180,17 +179,11 @@ def _metrics(
     return found
 
 
-def _at(forecast: Forecast, k: int) -> Forecast:
-    """The forecast at one of the fractions: [B, K, ...] -> [B, ...]."""
-    fields = (None if field is None else field[:, k] for field in forecast[:5])
-    return Forecast(*fields, forecast.fair)
-
-
 def _ends(primitive: InteractionPrimitive) -> Tensor:
     return primitive.basis.project(torch.ones(len(primitive)), primitive.weights)
 
 
-def _last_measured(trajectory: Tensor) -> Tensor:
+def last_measured(trajectory: Tensor) -> Tensor:
     """[D]: the last measured value of each DoF, NaN for one that was not measured in the last twentieth."""
     recent = trajectory[-max(1, len(trajectory) // 20) :]
     steps = torch.arange(len(recent)).unsqueeze(-1)

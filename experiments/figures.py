@@ -18,7 +18,26 @@ from torch_ebip.layout import Layout
 from torch_ebip.metrics import Z95
 from torch_ebip.noise import MeasurementNoise
 
-COLOURS = {"mean": "0.6", "nearest": "0.4", "ebip": "tab:red", "ebip_scaled": "tab:orange", "ebip_tuned": "tab:blue"}
+COLOURS = {
+    "mean": "0.7",
+    "nearest": "0.45",
+    "ballistic": "black",
+    "ridge": "tab:olive",
+    "trees": "tab:green",
+    "gru": "tab:cyan",
+    "bip": "tab:brown",
+    "particle_filter": "tab:purple",
+    "particle_filter_tuned": "plum",
+    "ebip_minus": "tab:pink",
+    "ebip": "tab:red",
+    "ebip_scaled": "tab:orange",
+    "ebip_tuned": "tab:blue",
+}
+
+
+def colour(method: str) -> str:
+    """The same colour for a method in every picture."""
+    return COLOURS.get(method, "black")
 
 
 def results_figure(results: Mapping[str, Any], panels: Sequence[tuple[str, str | None]]) -> Figure:
@@ -38,7 +57,7 @@ def results_figure(results: Mapping[str, Any], panels: Sequence[tuple[str, str |
             at = [cells.index((row["subset"], row["observed"])) + 0.14 * (i - (len(methods) - 1) / 2) for row in mine]
             errors = [row["standard_error"] or 0.0 for row in mine]
             means = [row["mean"] for row in mine]
-            axis.errorbar(at, means, errors, fmt="o", ms=4, capsize=2, color=COLOURS.get(method), label=method)
+            axis.errorbar(at, means, errors, fmt="o", ms=4, capsize=2, color=colour(method), label=method)
         axis.set_xticks(range(len(cells)), [_label(*cell) for cell in cells], fontsize=8)
         unit = "" if rows[0]["unit"] == "1" else f" [{rows[0]['unit']}]"
         axis.set_ylabel(f"{metric}{'' if modality is None else ' ' + modality}{unit}", fontsize=9)
@@ -82,9 +101,9 @@ def forecast_figure(
             for row, dof in enumerate(dofs):
                 mean = forecast.mean[:, names.index(dof)]
                 half = Z95 * forecast.variance[:, names.index(dof)].sqrt()
-                axis, colour = axes[row, column], COLOURS.get(label)
-                axis.plot(phase, mean, color=colour, lw=1.5, label=label)
-                axis.fill_between(phase, mean - half, mean + half, color=colour, alpha=0.18, lw=0)
+                axis, shade = axes[row, column], colour(label)
+                axis.plot(phase, mean, color=shade, lw=1.5, label=label)
+                axis.fill_between(phase, mean - half, mean + half, color=shade, alpha=0.18, lw=0)
         for row, dof in enumerate(dofs):
             axis = axes[row, column]
             truth = trajectory[:, layout.dofs.index(dof)]

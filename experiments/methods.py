@@ -11,7 +11,16 @@ import torch
 from torch import Tensor
 
 from experiments.run_folder import write_json
-from torch_ebip import BSplineBasis, Demonstrations, EnsembleFilter, InteractionPrimitive, ebip
+from torch_ebip import (
+    BSplineBasis,
+    Demonstrations,
+    EnsembleFilter,
+    Filter,
+    InteractionPrimitive,
+    ParticleFilter,
+    ebip,
+    particle_filter,
+)
 from torch_ebip.checkpoint import load_checkpoint
 from torch_ebip.kinematics import RobotArm
 from torch_ebip.losses import ForwardKinematicsLoss
@@ -52,15 +61,16 @@ class Problem:
         return ForecastObjective(self.primitive, self.targets, weights=weights, arm=loss, arm_dofs=joints)
 
 
-def scaled(primitive: InteractionPrimitive, factor: float) -> EnsembleFilter:
+def scaled(primitive: InteractionPrimitive, factor: float, members: int | None = None) -> EnsembleFilter:
     """The paper's eBIP with its R times one factor."""
-    return ebip(primitive, residual_variance=factor * primitive.residual_variance)
+    return ebip(primitive, members, residual_variance=factor * primitive.residual_variance)
 
 
-def tunable(primitive: InteractionPrimitive, factor: float) -> EnsembleFilter:
+def tunable(primitive: InteractionPrimitive, factor: float, members: int | None = None) -> EnsembleFilter:
     """What is tuned: square-root eBIP whose R depends on phase, with inflation and evidence weights."""
     return ebip(
         primitive,
+        members,
         residual_variance=factor * primitive.residual_variance,
         context=BSplineBasis(4),
         inflation=AboveOne(primitive.weights.new_tensor(1.002)),
@@ -69,9 +79,21 @@ def tunable(primitive: InteractionPrimitive, factor: float) -> EnsembleFilter:
     )
 
 
+def particle_tunable(primitive: InteractionPrimitive, factor: float, members: int | None = None) -> ParticleFilter:
+    """A particle filter to be tuned: R depends on phase, particles move a little, gradients pass resampling."""
+    return particle_filter(
+        primitive,
+        members,
+        residual_variance=factor * primitive.residual_variance,
+        weight_noise=0.05,
+        context=BSplineBasis(4),
+        softness=0.1,
+    )
+
+
 def best_factor(
     problem: Problem,
-    build: Callable[[InteractionPrimitive, float], EnsembleFilter],
+    build: Callable[[InteractionPrimitive, float], Filter],
     settings: TuningSettings,
     interactions: int,
     factors: Sequence[float],
@@ -108,7 +130,7 @@ def best_factor(
 
 def tune(
     problem: Problem,
-    filter: EnsembleFilter,
+    filter: Filter,
     settings: TuningSettings,
     monitor: Monitor | None,
     checkpoint: Path | None,
@@ -120,7 +142,7 @@ def tune(
 
 def _tuner(
     problem: Problem,
-    filter: EnsembleFilter,
+    filter: Filter,
     settings: TuningSettings,
     monitor: Monitor | None = None,
     checkpoint: Path | None = None,

@@ -27,25 +27,29 @@ Values = dict[Cell, dict[str, NDArray[np.float64]]]
 """For each cell and method one value an interaction; NaN where there is none."""
 
 
-def summarise(values: Values, reference: str) -> dict[str, Any]:
-    """``rows``, ``comparisons`` of every method with the reference, and ``summary``, means over the cells.
+def summarise(values: Values, reference: str | None = None) -> dict[str, Any]:
+    """``rows``, ``comparisons`` and ``summary``, means over the cells.
 
-    Comparisons are two-sided Mann-Whitney U tests, as in the paper.
+    Comparisons are two-sided Mann-Whitney U tests, as in the paper: of every method with the reference; without
+    one, with the best method of each cell.
     """
     rows, comparisons = [], []
     for cell, methods in values.items():
         key = {"subset": cell.subset, "observed": cell.observed, "metric": cell.metric, "modality": cell.modality}
         measured = {name: array[~np.isnan(array)] for name, array in methods.items()}
+        measured = {name: array for name, array in measured.items() if len(array)}
         for name, array in measured.items():
-            if len(array):
-                error = float(array.std(ddof=1) / math.sqrt(len(array))) if len(array) > 1 else None
-                statistics = {"mean": float(array.mean()), "standard_error": error, "n": len(array)}
-                rows.append({"method": name, **key, "unit": cell.unit, **statistics})
+            error = float(array.std(ddof=1) / math.sqrt(len(array))) if len(array) > 1 else None
+            statistics = {"mean": float(array.mean()), "standard_error": error, "n": len(array)}
+            rows.append({"method": name, **key, "unit": cell.unit, **statistics})
+        against = reference
+        if against is None and measured:
+            against = min(measured, key=lambda name: _badness(cell.metric, float(measured[name].mean())))
         for name, array in measured.items():
-            if name != reference and len(array) and len(measured.get(reference, ())):
-                p_value = float(mannwhitneyu(measured[reference], array).pvalue)
-                comparisons.append({**key, "a": reference, "b": name, "p_value": p_value})
-    return {"rows": rows, "comparisons": comparisons, "summary": _over_cells(rows)}
+            if name != against and against in measured:
+                p_value = float(mannwhitneyu(measured[against], array).pvalue)
+                comparisons.append({**key, "a": against, "b": name, "p_value": p_value})
+    return {"rows": rows, "comparisons": comparisons, "summary": _over_cells(rows), "reference": reference}
 
 
 def _over_cells(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -65,10 +69,25 @@ def _over_cells(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     ]
 
 
-def tables(results: Mapping[str, Any]) -> list[Table]:
-    """One table for each metric and modality: methods down, subsets and fractions across, the best in bold.
+class Grid(NamedTuple):
+    """One table: methods down, cells across, with the mean over cells at the end.
 
-    ``*`` marks what differs from the reference of the comparisons with p < 0.05.
+    Attributes:
+        title: metric, modality and unit.
+        columns: (subset, fraction) of each cell.
+        lines: for each method a text for each cell, and whether it is the best.
+    """
+
+    title: str
+    columns: list[tuple[str, float]]
+    lines: dict[str, list[tuple[str, bool]]]
+
+
+def grids(results: Mapping[str, Any], only: Sequence[tuple[str, str | None]] | None = None) -> list[Grid]:
+    """A table for each metric and modality, or for ``only`` some of these pairs.
+
+    With a reference, ``*`` marks what differs from it with p < 0.05; without, ``°`` marks what is not
+    significantly worse than the best of the cell.
     """
     rows, made = results["rows"], []
     columns = list(dict.fromkeys((row["subset"], row["observed"]) for row in rows))
@@ -78,51 +97,92 @@ def tables(results: Mapping[str, Any]) -> list[Table]:
         if c["p_value"] < 0.05
     }
     for metric, modality, unit in dict.fromkeys((row["metric"], row["modality"], row["unit"]) for row in rows):
-        title = " ".join(part for part in (metric, modality, f"[{unit}]".replace("[", "\\[")) if part)
-        table = Table(title=title, title_justify="left")
-        table.add_column("method")
-        for subset, observed in columns:
-            table.add_column(f"{subset}\n{observed:.0%}", justify="right")
-        table.add_column("mean of\ncells", justify="right")
+        if only is not None and (metric, modality) not in only:
+            continue
         group = [row for row in rows if (row["metric"], row["modality"]) == (metric, modality)]
+        # Millimetres where all is below a decimetre: as people speak of it.
+        factor, shown = (1e3, "mm") if unit == "m" and max(row["mean"] for row in group) < 0.1 else (1.0, unit)
         best = {
-            column: _best(metric, [row["mean"] for row in group if (row["subset"], row["observed"]) == column])
+            column: min(
+                (row["mean"] for row in group if (row["subset"], row["observed"]) == column),
+                key=lambda mean: _badness(metric, mean),
+                default=None,
+            )
             for column in columns
         }
+        lines: dict[str, list[tuple[str, bool]]] = {}
         for method in dict.fromkeys(row["method"] for row in group):
             line = {(row["subset"], row["observed"]): row for row in group if row["method"] == method}
             cells = []
             for column in columns:
                 if column not in line:
-                    cells.append("-")
+                    cells.append(("-", False))
                     continue
                 row = line[column]
-                text = f"{row['mean']:.3g}"
+                first = row["mean"] == best[column]
+                text = f"{factor * row['mean']:.3g}"
                 if row["standard_error"] is not None:
-                    text += f" ±{row['standard_error']:.1g}"
-                text += "*" if (*column, metric, modality, method) in differing else ""
-                cells.append(f"[bold]{text}[/bold]" if row["mean"] == best[column] else text)
+                    text += f" ±{factor * row['standard_error']:.1g}"
+                differs = (*column, metric, modality, method) in differing
+                if results["reference"] is None:
+                    text += "" if differs or first else "°"
+                else:
+                    text += "*" if differs else ""
+                cells.append((text, first))
             mean = next(
-                s["mean"]
+                s
                 for s in results["summary"]
                 if (s["method"], s["metric"], s["modality"]) == (method, metric, modality)
             )
-            table.add_row(method, *cells, f"{mean:.3g}")
-        made.append(table)
+            # A mean over fewer cells than others have would not compare with theirs.
+            whole = mean["cells"] == sum(best[column] is not None for column in columns)
+            lines[method] = [*cells, (f"{factor * mean['mean']:.3g}" if whole else "-", False)]
+        title = " ".join(part for part in (metric, modality, f"[{shown}]") if part)
+        made.append(Grid(title, columns, lines))
     return made
 
 
-def _best(metric: str, means: Sequence[float]) -> float | None:
-    if not means:
-        return None
-    return min(means, key=lambda mean: abs(mean - 0.95)) if metric == "coverage_95" else min(means)
+def legend(results: Mapping[str, Any]) -> str:
+    """What the marks in the tables mean."""
+    reference = results["reference"]
+    if reference is None:
+        return "bold: best of the cell; °: not significantly worse (Mann-Whitney U, p >= 0.05); ±: standard error"
+    return f"bold: best; *: differs from {reference} (Mann-Whitney U, p < 0.05); ±: standard error"
 
 
-def print_tables(results: Mapping[str, Any], console: Console | None = None) -> None:
-    """Print every table of the results."""
+def _badness(metric: str, mean: float) -> float:
+    return abs(mean - 0.95) if metric == "coverage_95" else mean
+
+
+def print_tables(
+    results: Mapping[str, Any],
+    console: Console | None = None,
+    only: Sequence[tuple[str, str | None]] | None = None,
+) -> None:
+    """Print the tables of the results, or only those of some (metric, modality)."""
     console = Console() if console is None else console
     if not console.is_terminal:
         console.width = max(console.width, 160)
-    for table in tables(results):
+    for grid in grids(results, only):
+        table = Table(title=grid.title.replace("[", "\\["), title_justify="left")
+        table.add_column("method")
+        for subset, observed in grid.columns:
+            table.add_column(f"{subset}\n{observed:.0%}", justify="right")
+        table.add_column("mean of\ncells", justify="right")
+        for method, cells in grid.lines.items():
+            table.add_row(method, *(f"[bold]{text}[/bold]" if best else text for text, best in cells))
         console.print(table)
-    console.print("* differs from ebip_tuned, Mann-Whitney U, p < 0.05; bold: best; ±: standard error")
+    console.print(legend(results))
+
+
+def markdown(results: Mapping[str, Any]) -> str:
+    """Every table of the results in Markdown."""
+    parts = []
+    for grid in grids(results):
+        heads = ["method", *(f"{subset} {observed:.0%}" for subset, observed in grid.columns), "mean"]
+        lines = [f"**{grid.title}**", "", f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}"]
+        for method, cells in grid.lines.items():
+            texts = (f"**{text}**" if best else text.replace("*", "\\*") for text, best in cells)
+            lines.append(f"| `{method}` | {' | '.join(texts)} |")
+        parts.append("\n".join(lines))
+    return "\n\n".join([*parts, legend(results)]) + "\n"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from torch_ebip.filters.forecast import Forecast
@@ -24,7 +25,8 @@ def mae(forecast: Forecast, target: Tensor) -> Tensor:
 def coverage_95(forecast: Forecast, target: Tensor) -> Tensor:
     """Share of the DoFs whose target lies in mean +- 1.96 deviations: [..., D] -> [...]; 0.95 would be right."""
     inside = (forecast.mean - target).abs() <= Z95 * forecast.variance.sqrt()
-    return inside.to(target.dtype).where(~target.isnan(), target).nanmean(-1)
+    unknown = target.isnan() | forecast.mean.isnan()
+    return inside.to(target.dtype).where(~unknown, torch.nan).nanmean(-1)
 
 
 def crps(forecast: Forecast, target: Tensor) -> Tensor:

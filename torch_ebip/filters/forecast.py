@@ -35,6 +35,16 @@ class Forecast(NamedTuple):
         members = None if self.members is None else self.members[..., dofs]
         return self._replace(mean=self.mean[..., dofs], variance=self.variance[..., dofs], members=members)
 
+    def at(self, index: int) -> Forecast:
+        """The forecast of one of the P phases: without that dimension."""
+        return self._replace(
+            mean=self.mean[..., index, :],
+            variance=self.variance[..., index, :],
+            phase=self.phase[..., index],
+            members=None if self.members is None else self.members[..., index, :, :],
+            weights=None if self.weights is None else self.weights[..., index, :],
+        )
+
     def crps(self, target: Tensor) -> Tensor:
         """Continuous ranked probability score of each DoF.
 

@@ -1,0 +1,35 @@
+"""What the baselines share: reading a prefix without looking past it, and answering with one value."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from experiments.evaluate import Answer, last_measured
+from torch_ebip import Demonstrations, Forecast
+
+Array = NDArray[np.float64]
+
+
+def ends(demonstrations: Demonstrations) -> Tensor:
+    """[N, D] in units of the DoFs: what is to be forecast, with the same rule as in `evaluate`."""
+    return torch.stack([last_measured(trajectory) for trajectory in demonstrations])
+
+
+def kept_steps(lengths: Tensor, fraction: float) -> Tensor:
+    """int64 [N]: last sample of the first `fraction` of recordings of `lengths` samples, as `evaluate` counts it."""
+    return ((lengths * fraction).round().long() - 1).clamp(min=0)
+
+
+def until(observed: Tensor, keep: Tensor) -> Tensor:
+    """bool [B, T, D]: what is observed up to and with sample keep, int64 [B]."""
+    return observed & (torch.arange(observed.shape[1]) <= keep.unsqueeze(-1)).unsqueeze(-1)
+
+
+def point_answer(mean: Tensor) -> Answer:
+    """An answer [B, K, D] that knows nothing of its uncertainty or of the phase."""
+    unknown = torch.full_like(mean, torch.nan)
+    phase = mean.new_full(mean.shape[:2], torch.nan)
+    return Answer(Forecast(mean, unknown, phase), phase)

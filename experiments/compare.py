@@ -1,0 +1,190 @@
+"""Table I: every method of the paper, tuned ones and baselines, by cross-validation.
+
+Methods: `bip`, `particle_filter`, `ebip_minus` and `ebip` are the paper's; `ebip_scaled` is eBIP with R times the
+best single factor; `ebip_tuned` and `particle_filter_tuned` are tuned by gradient; all of that happens inside each
+fold, never on its test part. `mean`, `nearest`, `ridge`, `trees`, `gru` and, for the simulated ball, `ballistic`
+are what one would try without a filter. Without --data the recordings are the simulated ball catching.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import torch
+
+from experiments.data import choose_subsets, load, thinning
+from experiments.entries import METHODS, Fold
+from experiments.evaluate import evaluate
+from experiments.figures import results_figure
+from experiments.folds import mean_of_cells, read_values, run_folds, share_cores, split, write_values
+from experiments.paper_table import paper_rows
+from experiments.results import Values, markdown, print_tables, summarise
+from experiments.run_folder import RunFolder, write_json
+from torch_ebip.files import atomic_write
+from torch_ebip.tuning import TuningSettings
+
+
+@dataclass(frozen=True)
+class Job:
+    """One fold: everything a worker needs."""
+
+    fold: int
+    folds: int
+    data: str | None
+    demonstrations: int
+    subsets: tuple[str, ...]
+    methods: tuple[str, ...]
+    members: int | None
+    seed: int
+    scan: int
+    threads: int
+    folder: str
+    tuning: TuningSettings
+
+
+def run_fold(job: Job) -> Values:
+    """Build and evaluate every method of one fold; what is finished is read from the fold's folder."""
+    torch.set_num_threads(job.threads)
+    folder = Path(job.folder)
+    demonstrations, task = load(job.data, job.demonstrations, job.seed)
+    task = choose_subsets(task, demonstrations.layout, job.subsets, alone=job.data is not None)
+    training, testing = split(len(demonstrations), job.folds, job.fold, job.seed)
+    known, tests = demonstrations.subset(training), demonstrations.subset(testing)
+    fold: Fold | None = None
+    merged: Values = {}
+    for name in job.methods:
+        finished = folder / f"{name}.json"
+        if not finished.exists():
+            began = time.monotonic()
+            if fold is None:
+                fold = Fold.of(known, task, job.seed, job.tuning, folder, job.members, job.scan)
+            method = METHODS[name](fold)
+            built = time.monotonic()
+            values = {} if method is None else evaluate(task, {name: method}, tests)
+            seconds = {"building": round(built - began, 2), "answering": round(time.monotonic() - built, 2)}
+            write_json(folder / f"{name}-seconds.json", seconds)
+            write_values(finished, values)
+        for cell, methods in read_values(finished).items():
+            merged.setdefault(cell, {}).update(methods)
+    return merged
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the experiment from the command line."""
+    options = _parser().parse_args(arguments)
+    began = time.monotonic()
+    tuning = TuningSettings(seed=options.seed, steps=options.steps)
+    count, scan = options.demonstrations, 48
+    if options.quick:
+        tuning = replace(tuning, steps=min(options.steps, 10), batch_size=8, validate_every=5)
+        count, scan = min(count, 60), 8
+    demonstrations, task = load(options.data, count, options.seed)
+    task = choose_subsets(task, demonstrations.layout, options.subsets, alone=options.data is not None)
+    tuning = replace(tuning, thinning=thinning(demonstrations))
+    folds = min(options.folds, 3) if options.quick else options.folds
+    if not 2 <= folds <= len(demonstrations):
+        raise SystemExit(f"--folds must be between 2 and the {len(demonstrations)} demonstrations, got {folds}")
+    if len(demonstrations) - -(-len(demonstrations) // folds) < 2 * tuning.folds:
+        raise SystemExit(
+            f"{len(demonstrations)} demonstrations in {folds} folds are too few: tuning filters the training part "
+            f"in {tuning.folds} folds of its own, and needs {2 * tuning.folds} of them"
+        )
+    if options.members is not None and options.members < 2:
+        raise SystemExit(f"--members must be at least 2, an ensemble needs a spread; got {options.members}")
+    settings = {
+        "data": options.data,
+        "demonstrations": None if options.data else count,
+        "folds": folds,
+        "methods": options.methods,
+        "subsets": {name: list(names) for name, names in task.subsets.items()},
+        "members": options.members,
+        "seed": options.seed,
+        "scan": scan,
+        "tuning": asdict(tuning),
+    }
+    run = RunFolder("compare", settings, options.out, options.force)
+    workers, threads = share_cores(folds, options.workers)
+    jobs = [
+        Job(fold, folds, options.data, count, tuple(options.subsets), tuple(options.methods), options.members,
+            options.seed, scan, threads, str(run.path / f"fold-{fold:02d}"), tuning)
+        for fold in range(folds)
+    ]  # fmt: skip
+    print(demonstrations)
+    shown = [name for name in ("ebip_tuned", "ebip_scaled", "trees") if name in options.methods][:2]
+
+    def headline(values: Values) -> str:
+        """Mean absolute error of a few methods over all cells so far."""
+        return ", ".join(f"{name} mae {mean_of_cells(values, name, 'mae'):.4f}" for name in shown)
+
+    try:
+        values = run_folds(run_fold, jobs, workers, headline)
+    except (ValueError, ImportError) as error:
+        raise SystemExit(f"{run.path}: {error}") from error
+    seconds: dict[str, float] = {}
+    for path in sorted(run.path.glob("fold-*/*-seconds.json")):
+        spent = sum(json.loads(path.read_text()).values())
+        name = path.name.removesuffix("-seconds.json")
+        seconds[name] = round(seconds.get(name, 0.0) + spent, 1)
+    results = {
+        "experiment": "compare",
+        "dataset": {
+            "source": options.data or "simulated ball catching",
+            "demonstrations": len(demonstrations),
+            "dofs": demonstrations.layout.n_dofs,
+            "rate": demonstrations.rate,
+            "folds": folds,
+        },
+        **summarise(values),
+        **({} if options.data else {"paper": paper_rows()}),
+        "seconds_by_method": seconds,
+        "seconds": round(time.monotonic() - began, 1),
+    }
+    panels: list[tuple[str, str | None]] = [(metric, m) for m in task.targets for metric in ("mae",)]
+    if task.arm is not None:
+        panels = [("mse", "robot"), ("mae", "ball"), ("tool_error", None)]
+    panels.append(("coverage_95", task.targets[0]))
+    with atomic_write(run.path / "results.md") as file:
+        file.write(markdown(results).encode())
+    results_figure(results, panels).savefig(run.path / "results.png", dpi=110)
+    write_json(run.results, results)
+    print_tables(results, only=panels)
+    print(f"all tables: {run.path / 'results.md'}")
+    print(f"{results['seconds']:.0f} s; written to {run.path}")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m experiments.compare",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--data", metavar="FILE.npz", help="recordings in the project's format (default: simulated)")
+    parser.add_argument("--demonstrations", type=int, default=221, metavar="N", help="simulated ones (default: 221)")
+    parser.add_argument("--folds", type=int, default=10, help="of the cross-validation (default: 10)")
+    parser.add_argument(
+        "--methods", nargs="+", choices=list(METHODS), default=list(METHODS), metavar="METHOD",
+        help=f"which to compare (default: all: {', '.join(METHODS)})",
+    )  # fmt: skip
+    parser.add_argument(
+        "--subsets", nargs="+", default=[], metavar="SUBSET",
+        help="sensors shown together, modality names joined by +, or `all` "
+        "(default: those of the paper; with --data each modality alone, and all)",
+    )  # fmt: skip
+    parser.add_argument("--members", type=int, metavar="E", help="of ensembles (default: N of the training part)")
+    parser.add_argument("--steps", type=int, default=100, help="gradient steps at most (default: 100)")
+    parser.add_argument("--seed", type=int, default=0, help="of data, splits and draws (default: 0)")
+    parser.add_argument("--quick", action="store_true", help="a small run of a few minutes, to see that all works")
+    parser.add_argument("--workers", type=int, help="processes for folds (default: one a core)")
+    parser.add_argument(
+        "--out", metavar="DIR", help="run folder (default: runs/compare/STAMP); resumes an unfinished run"
+    )
+    parser.add_argument("--force", action="store_true", help="start over, also where --out holds a finished run")
+    return parser
+
+
+if __name__ == "__main__":
+    main()
