@@ -19,6 +19,7 @@ from experiments.methods import (
     FACTORS,
     Problem,
     best_factor,
+    best_start,
     particle_tunable,
     scaled,
     tunable,
@@ -105,7 +106,7 @@ def _ebip_scaled(fold: Fold) -> Filter:
 
 def _ebip_tuned(fold: Fold) -> Filter:
     record = fold.folder / "scan_tunable.json"
-    start = best_factor(fold.problem, tunable, fold.tuning, fold.scan, [_factor(fold)], record)
+    start = best_start(fold.problem, fold.tuning, fold.scan, _factor(fold), record)
     filter = tunable(fold.problem.primitive, start, fold.members)
     tune(fold.problem, filter, fold.tuning, None, fold.folder / "ebip_tuned.pt", None)
     return filter

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -31,6 +33,15 @@ from torch_ebip.tuning import Tuner, TuningResult, TuningSettings
 
 FACTORS = (1.0, 10.0, 100.0, 1000.0, 10000.0)
 """Coarse grid of factors on the closed-form R; the best one is refined by half-decades."""
+SHARPNESSES = (3.16, 10.0, 31.6)
+"""Of the evidence weights, tried with every half-decade of R around the best factor."""
+
+
+class Start(NamedTuple):
+    """Where the gradient starts: a factor on R, and the sharpness of the evidence weights."""
+
+    factor: float
+    sharpness: float
 
 
 @dataclass(frozen=True)
@@ -66,16 +77,17 @@ def scaled(primitive: InteractionPrimitive, factor: float, members: int | None =
     return ebip(primitive, members, residual_variance=factor * primitive.residual_variance)
 
 
-def tunable(primitive: InteractionPrimitive, factor: float, members: int | None = None) -> EnsembleFilter:
+def tunable(primitive: InteractionPrimitive, start: Start, members: int | None = None) -> EnsembleFilter:
     """What is tuned: square-root eBIP whose R depends on phase, with inflation and evidence weights."""
     return ebip(
         primitive,
         members,
-        residual_variance=factor * primitive.residual_variance,
+        residual_variance=start.factor * primitive.residual_variance,
         context=BSplineBasis(4),
         inflation=AboveOne(primitive.weights.new_tensor(1.002)),
         square_root=True,
         weigh=True,
+        sharpness=start.sharpness,
     )
 
 
@@ -128,6 +140,23 @@ def best_factor(
     return min(losses, key=lambda factor: losses[factor])
 
 
+def best_start(problem: Problem, settings: TuningSettings, interactions: int, factor: float, record: Path) -> Start:
+    """The start of `tunable` with the smallest loss, among half-decades of R about a factor, and `SHARPNESSES`.
+
+    Other arguments: see `best_factor`.
+    """
+    if not record.exists():
+        order = torch.randperm(len(problem.primitive), generator=torch.Generator().manual_seed(settings.seed + 1))
+        losses = []
+        for half, sharpness in product((-0.5, 0.0, 0.5), SHARPNESSES):
+            start = Start(float(f"{factor * 10**half:.4g}"), sharpness)
+            loss = _tuner(problem, tunable(problem.primitive, start), settings).evaluate(order[:interactions])["loss"]
+            losses.append({**start._asdict(), "loss": loss})
+        write_json(record, losses)
+    best = min(json.loads(record.read_text()), key=lambda entry: entry["loss"])
+    return Start(best["factor"], best["sharpness"])
+
+
 def tune(
     problem: Problem,
     filter: Filter,
@@ -172,8 +201,8 @@ def restore(folder: Path, primitive: InteractionPrimitive) -> EnsembleFilter:
     Raises:
         FileNotFoundError, ValueError: the files are not there, or not what a run writes.
     """
-    start = json.loads((folder / "report.json").read_text())["factor_start"]
-    content = load_checkpoint(folder / "filter.pt", {"start": start})
+    start = Start(**json.loads((folder / "report.json").read_text())["start"])
+    content = load_checkpoint(folder / "filter.pt", {"start": start._asdict()})
     filter = tunable(primitive, start)
     filter.load_state_dict(content["parameters"], strict=False)
     return filter

@@ -21,7 +21,7 @@ from experiments.data import FRACTIONS, load, thinning
 from experiments.evaluate import FilterMethod, MeanMethod, NearestMethod, evaluate
 from experiments.figures import forecast_figure, noise_figure, results_figure
 from experiments.folds import mean_of_cells, read_values, run_folds, share_cores, split, write_values
-from experiments.methods import FACTORS, Problem, best_factor, scaled, tunable, tune
+from experiments.methods import FACTORS, Problem, best_factor, best_start, scaled, tunable, tune
 from experiments.results import Values, print_tables, summarise
 from experiments.run_folder import RunFolder, write_json
 from torch_ebip import InteractionPrimitive, select_basis
@@ -71,7 +71,7 @@ def run_fold(job: Job, progress: Callable[[int, float, float], None] | None = No
         (folder / "basis.txt").write_text(f"{choice}\n")
         monitor.text("basis", f"```\n{choice}\n```")
         factor = best_factor(problem, scaled, job.tuning, job.scan, FACTORS, folder / "scan_scaled.json")
-        start = best_factor(problem, tunable, job.tuning, job.scan, [factor], folder / "scan_tunable.json")
+        start = best_start(problem, job.tuning, job.scan, factor, folder / "scan_tunable.json")
         tuned = tunable(primitive, start)
         result = tune(problem, tuned, job.tuning, monitor, folder / "checkpoint.pt", progress)
         filters = {"ebip": scaled(primitive, 1.0), "ebip_scaled": scaled(primitive, factor), "ebip_tuned": tuned}
@@ -92,12 +92,13 @@ def run_fold(job: Job, progress: Callable[[int, float, float], None] | None = No
             for row in summary
             if row["method"] == "ebip_tuned"
         }
-        monitor.hyperparameters(asdict(job.tuning) | {"factor": start, "seed": job.seed, "fold": job.fold}, final)
+        choices = {**asdict(job.tuning), **start._asdict(), "seed": job.seed, "fold": job.fold}
+        monitor.hyperparameters(choices, final)
     report = {
         "n_weights": basis.n_weights,
         "basis": {m.name: str(basis.bases[layout.slice(m.name).start]) for m in layout.modalities},
         "factor_scaled": factor,
-        "factor_start": start,
+        "start": start._asdict(),
         "best_step": result.best_step,
         "stopped_early": result.stopped_early,
         "validation": result.validation,
@@ -106,7 +107,7 @@ def run_fold(job: Job, progress: Callable[[int, float, float], None] | None = No
     write_json(folder / "report.json", report)
     save_checkpoint(
         folder / "filter.pt",
-        {"start": start},
+        {"start": start._asdict()},
         {"parameters": {name: p.detach() for name, p in tuned.named_parameters()}},
     )
     write_values(finished, answers)

@@ -19,7 +19,7 @@ from torch_ebip.losses import (
     TrajectoryLoss,
     geodesic_angle,
 )
-from torch_ebip.scores import crps, energy_score
+from torch_ebip.scores import crps, energy_score, gaussian_crps
 
 
 def draws(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -46,6 +46,50 @@ def test_crps_of_a_large_ensemble_is_that_of_the_normal_distribution() -> None:
     for y in (-1.0, 0.3, 2.0):
         expected = y * (2 * norm.cdf(y) - 1) + 2 * norm.pdf(y) - 1 / math.sqrt(math.pi)
         assert crps(members, torch.tensor([y]).double()).item() == pytest.approx(expected, abs=0.01)
+
+
+def test_scores_of_a_normal_forecast() -> None:
+    """Against the integral of squared differences of the distribution functions."""
+    grid = np.linspace(-12, 12, 200_001)
+    for mean, deviation, y in ((0.5, 2.0, -1.0), (0.0, 0.3, 0.1)):
+        integrand = (norm.cdf(grid, mean, deviation) - (grid >= y)) ** 2
+        expected = np.trapezoid(integrand, grid)
+        values = torch.tensor([mean]).double(), torch.tensor([deviation**2]).double(), torch.tensor([y]).double()
+        assert gaussian_crps(*values).item() == pytest.approx(expected, abs=1e-4)
+    zero = torch.zeros(1).double()
+    assert gaussian_crps(zero, zero, zero + 2).item() == 2
+    variance = torch.ones(1).double().requires_grad_()
+    assert torch.autograd.gradcheck(gaussian_crps, (zero.clone().requires_grad_(), variance, zero + 1))
+
+
+def test_a_distribution_of_particles_is_scored_as_it_is() -> None:
+    members, target = draws(9, 2), draws(2, seed=1)
+    one = torch.zeros(9, dtype=torch.float64)
+    one[3] = 1
+    torch.testing.assert_close(crps(members, target, one, fair=False), (members[3] - target).abs())
+    x = members[:, 0].numpy()
+    expected = np.abs(x - target[0].item()).mean() - np.abs(x[:, None] - x[None]).mean() / 2
+    assert crps(members, target, fair=False)[0].item() == pytest.approx(expected)
+
+
+def test_a_forecast_scores_itself() -> None:
+    members, target = draws(4, 2, 50, 3), draws(4, 2, 3, seed=1)
+    weights = torch.softmax(draws(4, 2, 50, seed=2), -1)
+    mean, variance = (weights.unsqueeze(-1) * members).sum(-2), members.var(-2)
+    phase = torch.ones(4, 2)
+    forecast = Forecast(mean, variance, phase, members, weights)
+    torch.testing.assert_close(forecast.crps(target), crps(members, target, weights))
+    last = forecast.at(1).select(torch.tensor([2, 0]))
+    torch.testing.assert_close(last.crps(target[:, 1, [2, 0]]), forecast.crps(target)[:, 1, [2, 0]])
+    below = forecast.probability_below(target)
+    expected = (weights.unsqueeze(-1) * (members < target.unsqueeze(-2))).sum(-2)
+    torch.testing.assert_close(below, expected)
+    equal = Forecast(mean, variance, phase, members)
+    assert equal.probability_below(members[..., 7, :])[0, 0, 0] * 50 % 1 == pytest.approx(0.5)
+    normal = Forecast(mean, variance, phase)
+    torch.testing.assert_close(normal.crps(target), gaussian_crps(mean, variance, target))
+    z = ((target - mean) / variance.sqrt()).numpy()
+    np.testing.assert_allclose(normal.probability_below(target).numpy(), norm.cdf(z), atol=1e-12)
 
 
 def test_fair_scores_do_not_depend_on_the_size_of_the_ensemble() -> None:

@@ -63,6 +63,7 @@ def ensemble_update(
     observed: Tensor | None = None,
     taper: Taper | None = None,
     weights: Tensor | None = None,
+    inflation: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Stochastic ensemble Kalman update, X + K (y + eps - HX).
 
@@ -75,6 +76,7 @@ def ensemble_update(
         observed: bool [..., D]; default: everything.
         taper: localisation; default: none.
         weights: of the members, [..., E], summing to 1; default: equal.
+        inflation: factor [...] on the deviations from the mean after the update; default: none.
 
     Returns:
         The updated members [..., E, n] and the log-likelihood [...] of y under N(mean HX, S).
@@ -97,8 +99,8 @@ def ensemble_update(
     if innovation.observed is not None:
         departures = departures * innovation.observed.unsqueeze(-2)
     solved = torch.cholesky_solve(departures.transpose(-1, -2), innovation.cholesky).transpose(-1, -2)
-    increment = _through_gain(solved, members, innovation, taper, weights)
-    return members + increment, _log_likelihood(innovation)
+    updated = _through_gain(solved, members, innovation, taper, weights, inflation)
+    return updated, _log_likelihood(innovation)
 
 
 def square_root_update(
@@ -109,6 +111,7 @@ def square_root_update(
     observed: Tensor | None = None,
     taper: Taper | None = None,
     weights: Tensor | None = None,
+    inflation: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Deterministic update whose analysis covariance is the Kalman posterior of the ensemble's own covariance.
 
@@ -132,8 +135,8 @@ def square_root_update(
     shift = torch.cholesky_solve(innovation.residual.unsqueeze(-1), V).transpose(-1, -2)
     shrink = torch.linalg.solve_triangular(V + U, innovation.anomalies.transpose(-1, -2), upper=False)
     shrink = torch.linalg.solve_triangular(V.transpose(-1, -2), shrink, upper=True).transpose(-1, -2)
-    increment = _through_gain(shift - shrink, members, innovation, taper, weights)
-    return members + increment, _log_likelihood(innovation)
+    updated = _through_gain(shift - shrink, members, innovation, taper, weights, inflation)
+    return updated, _log_likelihood(innovation)
 
 
 def ensemble_mean(members: Tensor, weights: Tensor | None = None) -> Tensor:
@@ -163,14 +166,6 @@ def _shares(members: Tensor, weights: Tensor | None, unbiased: bool = True) -> T
     if not unbiased:
         return weights.unsqueeze(-1)
     return (weights / (1 - weights.square().sum(-1, keepdim=True))).unsqueeze(-1)
-
-
-def inflate(members: Tensor, factor: Tensor | float, weights: Tensor | None = None) -> Tensor:
-    """Scale the deviations from the mean of members [..., E, n] by a factor [...] (covariance by its square)."""
-    anomalies = members - ensemble_mean(members, weights).unsqueeze(-2)
-    # Added rather than scaled: a factor of exactly 1 leaves the members as they are, to the bit.
-    growth = torch.as_tensor(factor, dtype=members.dtype, device=members.device) - 1
-    return torch.addcmul(members, anomalies, growth[..., None, None])
 
 
 def systematic_resample(log_weights: Tensor, u: Tensor) -> Tensor:
@@ -268,24 +263,47 @@ def _innovation(
 
 
 def _through_gain(
-    solved: Tensor, members: Tensor, innovation: _Innovation, taper: Taper | None, weights: Tensor | None
+    solved: Tensor,
+    members: Tensor,
+    innovation: _Innovation,
+    taper: Taper | None,
+    weights: Tensor | None,
+    inflation: Tensor | None,
 ) -> Tensor:
-    """Rows [..., E, D] that already went through S^-1, times (HA)' A / (E - 1): increments [..., E, n].
+    """Members [..., E, n] after rows [..., E, D], that already went through S^-1, times (HA)' A / (E - 1).
 
-    With E members, D rows and n states the products cost 4 nED from the left of the members, 2 nE^2 + 2 E^2 D
-    by way of an E x E transform; the cheaper is taken.
+    Weighted anomalies sum to zero over members, so (HA)' A is (HA)' X: the anomalies of the state are never
+    formed. With E members, D rows and n states the products cost 4 nED from the left of the members, 2 nE^2 +
+    2 E^2 D by way of an E x E transform; the cheaper is taken.
+
+    With increments L C and mean m, inflation by g turns X + L C into g X + (g L + (1 - g) w'L) C + (1 - g) m.
     """
     E, n = members.shape[-2:]
     D = solved.shape[-1]
-    anomalies = members - ensemble_mean(members, weights).unsqueeze(-2)
     weighted = innovation.weighted.transpose(-1, -2)
-    if taper is None and 4 * n * D > 2 * n * E + 2 * E * D:
-        return solved @ weighted @ anomalies
-    cross = weighted @ anomalies
+    if taper is None and inflation is None and 4 * n * D > 2 * n * E + 2 * E * D:
+        return _add_product(members, solved @ weighted, members)
+    if inflation is not None:
+        growth = inflation[..., None, None].expand(*members.shape[:-2], 1, 1)
+        shares = members.new_full((E,), 1 / E) if weights is None else weights
+        shares = shares.unsqueeze(-2).expand(*members.shape[:-2], 1, E)
+        solved = growth * solved + (1 - growth) * (shares @ solved)
+        solved = torch.cat([solved, (1 - growth).expand(*members.shape[:-2], E, 1)], dim=-1)
+        weighted = torch.cat([weighted, shares], dim=-2)
+    cross = weighted @ members
     if taper is not None:
         factor = taper.state.transpose(-1, -2)
-        cross = cross * (factor if innovation.rows is None else factor.index_select(-2, innovation.rows))
-    return solved @ cross
+        factor = factor if innovation.rows is None else factor.index_select(-2, innovation.rows)
+        cross = torch.cat([cross[..., :D, :] * factor, cross[..., D:, :]], dim=-2)
+    return _add_product(members if inflation is None else growth * members, solved, cross)
+
+
+def _add_product(base: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    """base + a @ b in one pass over the base."""
+    if base.ndim == 2:
+        return torch.addmm(base, a, b)
+    flat = (part.expand(*base.shape[:-2], *part.shape[-2:]).reshape(-1, *part.shape[-2:]) for part in (base, a, b))
+    return torch.baddbmm(*flat).reshape(base.shape)
 
 
 def _log_likelihood(innovation: _Innovation) -> Tensor:

@@ -96,6 +96,7 @@ def noise_scalars(filter: nn.Module, layout: Layout) -> dict[str, float]:
                 values["weighting/sharpness"] = float(module.sharpness.value)
                 values["weighting/forgetting"] = float(module.forgetting.value)
                 values["weighting/slope"] = float(module.slope.value)
+                values["weighting/wander"] = float(module.wander.value)
                 factors = zip(layout.names, module.factor.value.tolist(), strict=True)
                 values |= {f"weighting/factor/{name}": factor for name, factor in factors}
             elif isinstance(module, AboveOne):

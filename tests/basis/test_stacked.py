@@ -22,6 +22,23 @@ def test_projection_is_a_sum_for_each_dof() -> None:
         np.testing.assert_allclose(slopes[..., dof].numpy(), expected, atol=1e-12)
 
 
+def test_paths_rows_and_covariances_are_projections() -> None:
+    basis = stack()
+    weights = torch.randn(4, 3, basis.n_weights, dtype=torch.float64)
+    phases = torch.rand(4, 3, 6, dtype=torch.float64)
+    paths = basis.project_paths(phases, weights)
+    for p in range(6):
+        torch.testing.assert_close(paths[:, :, p], basis.project(phases[..., p], weights))
+    torch.testing.assert_close(basis.project_paths(phases, weights, [0, 2, 3]), paths[..., [0, 2, 3]])
+    torch.testing.assert_close(basis.project(phases[..., 0], weights, [1, 4]), paths[:, :, 0, [1, 4]])
+    rows = basis.project_rows(phases[:, 0, 0], weights)
+    torch.testing.assert_close(rows, basis.project(phases[:, :1, 0], weights))
+    # The variance of h over many draws is that of the covariance they were drawn with, exactly for the sample one.
+    sample = weights[0].T.cov()
+    values = basis.project_paths(phases[0, :1].expand(3, -1), weights[0])
+    torch.testing.assert_close(basis.project_covariance(phases[0, 0], sample), values.var(0))
+
+
 def test_phases_and_weights_broadcast() -> None:
     basis = stack()
     weights = torch.randn(7, basis.n_weights)

@@ -16,7 +16,7 @@ from experiments import tune
 from experiments.data import load
 from experiments.evaluate import FilterMethod, MeanMethod, NearestMethod, Task, evaluate
 from experiments.folds import split
-from experiments.methods import Problem, best_factor, restore, scaled, tunable
+from experiments.methods import Problem, Start, best_factor, best_start, restore, scaled, tunable
 from tests.conftest import interactions, small_primitive
 from torch_ebip import BSplineBasis, Demonstrations, InteractionPrimitive, Layout, Modality, select_basis
 
@@ -152,13 +152,31 @@ def test_the_best_factor_does_not_wander_when_asked_again(tmp_path: Path) -> Non
     assert answers[0] == min(losses, key=lambda factor: losses[factor])
 
 
+def test_the_start_is_the_best_of_the_grid(tmp_path: Path) -> None:
+    made = interactions(30)
+    primitive = InteractionPrimitive.fit(made, select_basis(made, [BSplineBasis(6)]))
+    layout = made.layout
+    problem = Problem(made, primitive, layout.mask(["arm"]), {"all": layout.mask(["hand", "gaze"])}, None)
+    settings = tune.TuningSettings(folds=4, thinning=2)
+    start = best_start(problem, settings, 6, 100.0, tmp_path / "scan.json")
+    losses = json.loads((tmp_path / "scan.json").read_text())
+    assert len(losses) == 9
+    best = min(losses, key=lambda entry: entry["loss"])
+    assert start == Start(best["factor"], best["sharpness"])
+    filter = tunable(primitive, start)
+    assert filter.weighting.sharpness.value.item() == pytest.approx(start.sharpness)
+    ratio = filter.noise.measurement.variance.value / primitive.residual_variance
+    assert ratio.mean().item() == pytest.approx(start.factor, rel=1e-4)
+    assert best_start(problem, settings, 6, 100.0, tmp_path / "scan.json") == start
+
+
 def test_the_simulated_task_has_the_papers_nine_cells() -> None:
     demonstrations, task = load(None, 16, 0)
     primitive = InteractionPrimitive.fit(
         demonstrations.subset(range(12)), select_basis(demonstrations, [BSplineBasis(8)])
     )
     tests = demonstrations.subset(range(12, 16))
-    values = evaluate(task, {"ebip_tuned": FilterMethod(tunable(primitive, 100.0), 0)}, tests)
+    values = evaluate(task, {"ebip_tuned": FilterMethod(tunable(primitive, Start(100.0, 10.0)), 0)}, tests)
     cells = {(cell.subset, cell.observed) for cell in values}
     assert len(cells) == 9
     assert ("ball", 0.43) not in cells
@@ -171,7 +189,7 @@ def test_the_simulated_task_has_the_papers_nine_cells() -> None:
     } <= metrics
     # The squared error is of the first three joints, the tool's through forward kinematics.
     cell = next(c for c in values if (c.metric, c.modality, c.subset, c.observed) == ("mse", "robot", "ball", 0.82))
-    method = FilterMethod(tunable(primitive, 100.0), 0)
+    method = FilterMethod(tunable(primitive, Start(100.0, 10.0)), 0)
     y, measured = tests.pad()
     steps = (tests.lengths * 0.82).round().long().unsqueeze(-1) - 1
     both = torch.cat([(tests.lengths * 0.43).round().long().unsqueeze(-1) - 1, steps], -1)
@@ -199,7 +217,7 @@ def test_tuning_through_the_arm_reaches_the_noise() -> None:
     problem = Problem(
         demonstrations, primitive, layout.mask(task.targets), subsets, (task.arm[0], layout.mask(["robot"]))
     )
-    filter = tunable(primitive, 100.0)
+    filter = tunable(primitive, Start(100.0, 10.0))
     settings = tune.TuningSettings(steps=2, batch_size=4, validate_every=1, folds=2)
     result = tune.tune(problem, filter, settings, None, None, None)
     assert set(result.validation) == {0, 1, 2}

@@ -13,11 +13,13 @@ def draws(*shape: int, seed: int) -> torch.Tensor:
 
 def test_weights_are_those_of_the_formula() -> None:
     variance = torch.tensor([0.5, 2.0, 4.0], dtype=torch.float64)
-    module = EvidenceWeighting(variance, torch.tensor([0, 0, 1]), sharpness=3.0, forgetting=4.0, slope=1.5)
+    module = EvidenceWeighting(
+        variance, torch.tensor([0, 0, 1]), 3.0, forgetting=4.0, slope=1.5, wander=0.1, offsets=(-0.1, 0.0, 0.2)
+    )
     with torch.no_grad():
         module.factor.raw[1] = 1.0
     factor = module.factor.value.detach().numpy()[[0, 0, 1]]
-    projections, y = draws(5, 7, 3, seed=0), draws(5, 3, seed=1)
+    projections, y = draws(5, 7, 3, 3, seed=0), draws(5, 3, seed=1)
     observed = np.array([[1, 1, 1], [1, 0, 1], [0, 0, 0], [0, 1, 0], [1, 1, 1]], dtype=bool)
     dt, phases = 0.1, torch.linspace(0.1, 0.9, 5, dtype=torch.float64)
     evidence = module.start(torch.zeros(7, 9, dtype=torch.float64))
@@ -31,8 +33,11 @@ def test_weights_are_those_of_the_formula() -> None:
         evidence = module.learn(evidence, projections[t], value, shown, phases[t], None)
         if observed[t].any():
             squares = (projections[t] - y[t]).numpy() ** 2 * factor / variance.numpy()
-            misfit, seen = misfit + squares[:, observed[t]].mean(-1), seen + 1
-            logits = -0.5 * misfit / seen * 3.0 * np.exp(1.5 * (phases[t].item() - 0.5))
+            temper = 0.5 * 3.0 * np.exp(1.5 * (phases[t].item() - 0.5))
+            prior = np.exp([-0.5, 0.0, -2.0])
+            likelihood = np.exp(-temper * squares[..., observed[t]].mean(-1)) @ (prior / prior.sum())
+            misfit, seen = misfit - np.log(likelihood) / temper, seen + 1
+            logits = -misfit / seen * temper
             soft = np.exp(logits - logits.max())
             weights = 0.98 * soft / soft.sum() + 0.02 / 7
         np.testing.assert_allclose(evidence.weights.detach().numpy(), weights, atol=1e-12, err_msg=f"sample {t}")

@@ -19,6 +19,12 @@ class _Run(NamedTuple):
     dofs: slice
     weights: slice
 
+    def wanted(self, dofs: Sequence[int] | None) -> list[int]:
+        """Which of the run's DoFs are among some, ascending indices (None for all), counted from its first."""
+        if dofs is None:
+            return list(range(self.dofs.stop - self.dofs.start))
+        return [dof - self.dofs.start for dof in dofs if self.dofs.start <= dof < self.dofs.stop]
+
 
 class StackedBasis(nn.Module):
     """A basis for each of D DoFs and the projection of weights through them, y = h(phi, w).
@@ -76,29 +82,22 @@ class StackedBasis(nn.Module):
             raise ValueError(f"dofs must be bool [{self.n_dofs}], got {dofs.dtype} {tuple(dofs.shape)}")
         return StackedBasis([basis for basis, chosen in zip(self.bases, dofs.tolist(), strict=True) if chosen])
 
-    def project(self, phase: Tensor, weights: Tensor) -> Tensor:
-        """h(phi, w): phases [...] and weights [..., n_weights] of shapes that broadcast -> values [..., D]."""
-        return self.project_many(phase, [weights])[0]
+    def project(self, phase: Tensor, weights: Tensor, dofs: Sequence[int] | None = None) -> Tensor:
+        """h(phi, w), a phase for each set of weights.
+
+        Args:
+            phase: [...].
+            weights: [..., n_weights], of a shape that broadcasts with the phases.
+            dofs: ascending indices of the k DoFs that are wanted; default: all D.
+
+        Returns:
+            [..., k], units of the DoFs.
+        """
+        return self._project([basis(phase) for basis in self._families()], weights, dofs)
 
     def project_derivative(self, phase: Tensor, weights: Tensor) -> Tensor:
         """dh/dphi, shapes as `project`: the first column of the paper's Jacobian (equation of H_t)."""
         return self._project([basis.derivative(phase) for basis in self._families()], weights, None)
-
-    def project_many(
-        self, phase: Tensor, weights: Sequence[Tensor], dofs: Sequence[int] | None = None
-    ) -> list[Tensor]:
-        """`project` of several sets of weights at the same phases, which are evaluated once.
-
-        Args:
-            phase: [...].
-            weights: each [..., n_weights].
-            dofs: ascending indices of the k DoFs that are wanted; default: all.
-
-        Returns:
-            For each set of weights values [..., k].
-        """
-        features = [basis(phase) for basis in self._families()]
-        return [self._project(features, part, dofs) for part in weights]
 
     def project_rows(self, phase: Tensor, matrix: Tensor) -> Tensor:
         """h(phi, row) of every row of a matrix: with a covariance of the weights, the product with dh/dw'.
@@ -114,11 +113,32 @@ class StackedBasis(nn.Module):
         """
         features = [basis(phase) for basis in self._families()]
         parts = []
-        for run in self._runs:
-            block = matrix[..., run.weights]
+        for run, block in zip(self._runs, self._blocks(matrix), strict=True):
             shape = (*block.shape[:-1], run.dofs.stop - run.dofs.start)
             flat = block.reshape(*block.shape[:-2], -1, features[run.basis].shape[-1])
             parts.append((flat @ features[run.basis].unsqueeze(-1)).reshape(shape))
+        return torch.cat(parts, dim=-1)
+
+    def project_paths(self, phase: Tensor, weights: Tensor, dofs: Sequence[int] | None = None) -> Tensor:
+        """h(phi, w) of each set of weights at several phases.
+
+        Args:
+            phase: [..., P].
+            weights: [..., n_weights].
+            dofs: ascending indices of the k DoFs that are wanted; default: all.
+
+        Returns:
+            [..., P, k].
+        """
+        features = [basis(phase) for basis in self._families()]
+        parts = []
+        for run, block in zip(self._runs, self._blocks(weights), strict=True):
+            wanted = run.wanted(dofs)
+            if wanted:
+                functions = features[run.basis]
+                block = block.reshape(*block.shape[:-1], -1, functions.shape[-1])
+                block = block if len(wanted) == block.shape[-2] else block[..., wanted, :]
+                parts.append(functions @ block.transpose(-1, -2))
         return torch.cat(parts, dim=-1)
 
     def project_covariance(self, phase: Tensor, covariance: Tensor) -> Tensor:
@@ -146,17 +166,21 @@ class StackedBasis(nn.Module):
         return list(self.unique)  # type: ignore[arg-type]
 
     def _project(self, features: Sequence[Tensor], weights: Tensor, dofs: Sequence[int] | None) -> Tensor:
+        parts = []
+        for run, block in zip(self._runs, self._blocks(weights), strict=True):
+            wanted = run.wanted(dofs)
+            if wanted:
+                count = run.dofs.stop - run.dofs.start
+                block = block.reshape(*block.shape[:-1], count, -1)
+                values = (block @ features[run.basis].unsqueeze(-1)).squeeze(-1)
+                parts.append(values if len(wanted) == count else values[..., wanted])
+        return torch.cat(parts, dim=-1)
+
+    def _blocks(self, weights: Tensor) -> Sequence[Tensor]:
+        """The weights of each run, [..., k]: by one split, whose backward pass is one concatenation."""
         if weights.shape[-1] != self.n_weights:
             raise ValueError(f"weights must end in {self.n_weights}, got {tuple(weights.shape)}")
-        parts = []
-        for run in self._runs:
-            start, stop = run.dofs.start, run.dofs.stop
-            wanted = list(range(start, stop)) if dofs is None else [dof for dof in dofs if start <= dof < stop]
-            if wanted:
-                block = weights[..., run.weights].reshape(*weights.shape[:-1], stop - start, -1)
-                values = (block @ features[run.basis].unsqueeze(-1)).squeeze(-1)
-                parts.append(values if len(wanted) == stop - start else values[..., [dof - start for dof in wanted]])
-        return torch.cat(parts, dim=-1)
+        return torch.split(weights, [run.weights.stop - run.weights.start for run in self._runs], dim=-1)
 
     def _find_runs(self) -> list[_Run]:
         runs: list[_Run] = []

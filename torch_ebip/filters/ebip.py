@@ -26,6 +26,7 @@ def ebip(
     inflation: float | nn.Module | None = None,
     square_root: bool = False,
     weigh: bool = False,
+    sharpness: float = 10.0,
 ) -> EnsembleFilter:
     """The paper's eBIP (Section IV): members are demonstrations, R is the closed form.
 
@@ -42,13 +43,14 @@ def ebip(
         inflation: of the anomalies; see `EnsembleFilter`.
         square_root: deterministic update.
         weigh: weigh members by the evidence for their demonstrations; see `EvidenceWeighting`.
+        sharpness: of that evidence at the start.
 
     Returns:
         A filter with parameters of its own, in the dtype and on the device of the primitive.
     """
     prior = DemonstrationPrior(demonstration_states(primitive))
     count = len(primitive) if n_members is None else n_members
-    options = (residual_variance, weight_noise, context, localise, inflation, square_root, weigh)
+    options = (residual_variance, weight_noise, context, localise, inflation, square_root, weigh, sharpness)
     return _build(primitive, prior, count, *options)
 
 
@@ -85,7 +87,7 @@ def ebip_minus(
     """
     states = demonstration_states(primitive)
     prior = MixturePrior(states, fit_responsibilities(primitive.weights, max_components, seed))
-    options = (residual_variance, weight_noise, context, localise, inflation, square_root, False)
+    options = (residual_variance, weight_noise, context, localise, inflation, square_root)
     return _build(primitive, prior, n_members, *options)
 
 
@@ -99,7 +101,8 @@ def _build(
     localise: bool,
     inflation: float | nn.Module | None,
     square_root: bool,
-    weigh: bool,
+    weigh: bool = False,
+    sharpness: float = 1.0,
 ) -> EnsembleFilter:
     model = interaction_model(primitive, residual_variance, weight_noise, context)
     layout = primitive.layout
@@ -111,7 +114,8 @@ def _build(
         localisation = localisation.to(primitive.weights)
     weighting = None
     if weigh:
-        weighting = EvidenceWeighting(primitive.value_variance, layout.modality_of_dof.to(primitive.weights.device))
+        modality_of_dof = layout.modality_of_dof.to(primitive.weights.device)
+        weighting = EvidenceWeighting(primitive.value_variance, modality_of_dof, sharpness)
     return EnsembleFilter(
         model.dynamics,
         model.observation,

@@ -125,44 +125,52 @@ class EnsembleFilter(MemberFilter):
         if not bool(measured.any()):
             return state, state.members.new_zeros(observed.shape[:-1])
         rows = None if bool(measured.all()) else measured.nonzero().squeeze(-1)
-        members, weights, evidence = state.members, state.weights, state.evidence
-        phase = self._phase_or_none(state)
+        members, weights = state.members, state.weights
+        phase, projections, evidence = self._measure(state, y, observed, rows)
         deviation = self._deviation(phase)
         taper = None if self.localisation is None else self.localisation()
-        projections, origins = self._project_rows(state, rows)
         if rows is not None:
             y, observed, deviation = y[..., rows], observed[..., rows], deviation[..., rows]
             taper = None if taper is None else Taper(taper.state[:, rows], taper.observation[rows][:, rows])
         factor = torch.diag_embed(deviation)
+        growth = None
+        if self.inflation is not None:
+            growth = torch.where(observed.any(-1), self._inflation_factor(members) ** self.thinning, 1)
         try:
             if self.square_root:
                 updated, likelihood = functional.square_root_update(
-                    members, projections, y, factor, observed, taper, weights
+                    members, projections, y, factor, observed, taper, weights, growth
                 )
             else:
                 draws = standard_normal(projections.shape, members, generator)
                 updated, likelihood = functional.ensemble_update(
-                    members, projections, y, factor, draws, observed, taper, weights
+                    members, projections, y, factor, draws, observed, taper, weights, growth
                 )
         except functional.FactorisationError as error:
             raise self._named(error, rows) from error
-        if self.inflation is not None:
-            growth = torch.where(observed.any(-1), self._inflation_factor(members) ** self.thinning, 1)
-            updated = functional.inflate(updated, growth, weights)
-        if self.weighting is not None and evidence is not None and origins is not None and phase is not None:
-            columns = self.columns if rows is None else rows if self.columns is None else self.columns[rows]
-            evidence = self.weighting.learn(evidence, origins, y, observed, phase, columns)
         return EnsembleState(updated, evidence), likelihood
 
-    def _project_rows(self, state: EnsembleState, rows: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """h of the members and, for the evidence, of the demonstrations they came from, at the members' phases."""
-        if isinstance(self.observation, BasisProjection):
-            dofs = None if rows is None else rows.tolist()
-            others = () if state.evidence is None else (state.evidence.origin,)
-            projections, *origins = self.observation.rows(state.members, dofs, *others)
-            return projections, origins[0] if origins else None
-        projections = self.observation(state.members)
-        return projections if rows is None else projections[..., rows], None
+    def _measure(
+        self, state: EnsembleState, y: Tensor, observed: Tensor, rows: Tensor | None
+    ) -> tuple[Tensor | None, Tensor, Evidence | None]:
+        """Mean phase [...], projections [..., E, k] of some DoFs, and the evidence with y [..., D] added to it."""
+        members, weights, evidence = state.members, state.weights, state.evidence
+        if not isinstance(self.observation, BasisProjection):
+            return self._phase_or_none(state), self._project_rows(members, rows), evidence
+        weighting = self.weighting
+        origin, offsets = (
+            (None, None) if evidence is None or weighting is None else (evidence.origin, weighting.offsets)
+        )
+        dofs = None if rows is None else rows.tolist()
+        phases, projections, paths = self.observation.measure(members, dofs, origin, offsets)
+        phase = functional.ensemble_mean(phases.unsqueeze(-1), weights).squeeze(-1)
+        if weighting is not None and evidence is not None and paths is not None:
+            columns = self.columns
+            if rows is not None:
+                y, observed = y[..., rows], observed[..., rows]
+                columns = rows if columns is None else columns[rows]
+            evidence = weighting.learn(evidence, paths, y, observed, phase, columns)
+        return phase, projections, evidence
 
     def _inflation_factor(self, members: Tensor) -> Tensor:
         value = self.inflation.value if isinstance(self.inflation, nn.Module) else self.inflation

@@ -2,12 +2,16 @@
 
 The linear update shifts every demonstration by the same gain, which is right for a Gaussian prior. Real
 demonstrations come in clusters. Here each member keeps the demonstration it came from, and a tempered particle
-weight beside its Kalman shift: exp(-d^2 / 2h), d^2 the mean squared distance of that demonstration, at the
+weight beside its Kalman shift: exp(-d^2 / 2h), d^2 the mean squared distance of that demonstration, near the
 member's phase, from the recent measurements. Missing sensors, uncertainty and gradients work as before.
+
+Near, because the phase is known to a few hundredths only, and two demonstrations compared at the wrong phases
+seem to differ by their movement in between: the likelihood is averaged over a few phases about the member's.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -35,8 +39,13 @@ class Evidence(NamedTuple):
 class EvidenceWeighting(nn.Module):
     """Weights (1 - defensive) softmax_j(-d_j^2 sharpness exp(slope (phase - 1/2)) / 2) + defensive / E.
 
-    d_j^2 is the mean over recent samples, exponentially forgotten, and over measured DoFs of the squared
-    distance in units of each DoF's variance, times a factor for its modality.
+    d_j^2 is the mean over recent samples, exponentially forgotten, of the distance D_j^2 of each, with t the
+    sharpness at that phase:
+
+        exp(-t D_j^2 / 2) = sum_o p_o exp(-t D_jo^2 / 2),  p_o ~ exp(-o^2 / (2 wander^2)),
+
+    where D_jo^2 is the mean over measured DoFs of the squared distance at the member's phase + o, in units of
+    each DoF's variance, times a factor for its modality.
 
     Args:
         variance: [D], of each DoF over the demonstrations, squared units.
@@ -45,10 +54,13 @@ class EvidenceWeighting(nn.Module):
         forgetting: rate at the start, 1/s; learned.
         slope: of the log sharpness over phase at the start; learned.
         defensive: share that is spread evenly over all members, so that no weight vanishes.
+        wander: uncertainty of a member's phase at the start, a standard deviation; learned.
+        offsets: [O], from a member's phase to where its demonstration is compared.
     """
 
     variance: Tensor
     modality_of_dof: Tensor
+    offsets: Tensor
 
     def __init__(
         self,
@@ -58,6 +70,8 @@ class EvidenceWeighting(nn.Module):
         forgetting: float = 6.0,
         slope: float = 2.0,
         defensive: float = 0.02,
+        wander: float = 0.08,
+        offsets: Sequence[float] = (-0.1, -0.05, 0.0, 0.05, 0.1),
     ) -> None:
         super().__init__()
         if not 0 < defensive < 1:
@@ -68,6 +82,8 @@ class EvidenceWeighting(nn.Module):
         self.forgetting = Positive(variance.new_tensor(forgetting))
         self.slope = Positive(variance.new_tensor(slope))
         self.factor = Positive(variance.new_ones(int(modality_of_dof.max()) + 1))
+        self.wander = Positive(variance.new_tensor(wander))
+        self.register_buffer("offsets", variance.new_tensor(offsets))
         self.defensive = defensive
 
     def start(self, members: Tensor) -> Evidence:
@@ -94,7 +110,8 @@ class EvidenceWeighting(nn.Module):
 
         Args:
             evidence: so far.
-            projections: [..., E, D], of the demonstrations (`Evidence.origin`) at the members' phases.
+            projections: [..., E, O, D], of the demonstrations (`Evidence.origin`) at the members' phases +
+                `offsets`.
             y: [..., D]; ignored where not observed.
             observed: bool [..., D].
             phase: [...], mean phase.
@@ -105,12 +122,14 @@ class EvidenceWeighting(nn.Module):
         # A DoF that never moved in the demonstrations says nothing about which of them this is.
         scale = torch.where(variance > 0, self.factor.value[modality] / torch.where(variance > 0, variance, 1), 0)
         scale = torch.where(observed, scale, 0) / observed.sum(-1, keepdim=True).clamp(min=1)
-        difference = projections - torch.where(observed, y, 0).unsqueeze(-2)
-        distance = (difference.square() @ scale.unsqueeze(-1)).squeeze(-1)
-        any_observed = observed.any(-1)
-        misfit = evidence.misfit + distance
-        seen = evidence.seen + any_observed.to(distance)
+        difference = projections - torch.where(observed, y, 0)[..., None, None, :]
+        distance = (difference.square() @ scale[..., None, :, None]).squeeze(-1)
         temper = 0.5 * self.sharpness.value * torch.exp(self.slope.value * (phase - 0.5))
+        prior = torch.log_softmax(-0.5 * (self.offsets / self.wander.value).square(), -1)
+        likelihood = torch.logsumexp(prior - distance * temper[..., None, None], -1)
+        any_observed = observed.any(-1)
+        misfit = evidence.misfit - likelihood / temper.unsqueeze(-1)
+        seen = evidence.seen + any_observed.to(distance)
         mean = misfit / torch.where(seen > 0, seen, 1).unsqueeze(-1)
         weights = torch.softmax(-mean * temper.unsqueeze(-1), dim=-1)
         weights = (1 - self.defensive) * weights + self.defensive / weights.shape[-1]

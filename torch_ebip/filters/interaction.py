@@ -13,6 +13,15 @@ from torch import Tensor, nn
 from torch_ebip.basis.stacked import StackedBasis
 
 
+def split_state(members: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Phase [..., 1], phase velocity [..., 1] and weights [..., n - 2] of states [..., n].
+
+    A split, not three slices: its backward pass is one concatenation instead of three mostly empty tensors.
+    """
+    phase, velocity, weights = torch.split(members, [1, 1, members.shape[-1] - 2], dim=-1)
+    return phase, velocity, weights
+
+
 class ConstantVelocityPhase(nn.Module):
     """g(x): the phase advances by its velocity times dt, all else stays (the paper's matrix G).
 
@@ -32,8 +41,7 @@ class ConstantVelocityPhase(nn.Module):
 
     def forward(self, members: Tensor, dt: Tensor) -> Tensor:
         """Members [..., E, n] after dt [...] seconds."""
-        # One split instead of several slices: its backward pass is one concatenation.
-        phase, velocity, weights = members.tensor_split((1, 2), dim=-1)
+        phase, velocity, weights = split_state(members)
         phase = phase + velocity * dt[..., None, None]
         excess = phase - phase.clamp(0, 1)
         phase = phase - excess * excess.abs() / (self.overrun + excess.abs())
@@ -59,16 +67,33 @@ class BasisProjection(nn.Module):
 
     def forward(self, members: Tensor) -> Tensor:
         """Projections [..., E, D] of members [..., E, n]."""
-        return self.rows(members, None)[0]
+        return self.rows(members, None)
 
-    def rows(self, members: Tensor, dofs: Sequence[int] | None, *others: Tensor) -> list[Tensor]:
-        """Projections [..., E, k] of some DoFs (ascending indices; None for all).
+    def rows(self, members: Tensor, dofs: Sequence[int] | None) -> Tensor:
+        """Projections [..., E, k] of some DoFs (ascending indices; None for all)."""
+        phase, _, weights = split_state(members)
+        return self.basis.project(phase.squeeze(-1), weights, dofs)
 
-        First those of members [..., E, n], then those of ``others``, weights [..., E, n_weights] that take the
-        place of the members' own.
+    def measure(
+        self, members: Tensor, dofs: Sequence[int] | None, others: Tensor | None, offsets: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """What an update needs to know of members, in one pass over them.
+
+        Args:
+            members: [..., E, n].
+            dofs: ascending indices of k DoFs; None for all.
+            others: weights [..., E, n_weights] to be projected at the members' phases too; default: none.
+            offsets: [O], added to the phases for these; what lies beyond the interval is moved to its ends.
+
+        Returns:
+            Phases [..., E], projections [..., E, k], and those of the others, [..., E, O, k].
         """
-        phase, _, weights = members.tensor_split((1, 2), dim=-1)
-        return self.basis.project_many(phase.squeeze(-1), [weights, *others], dofs)
+        phase, _, weights = split_state(members)
+        paths = None
+        if others is not None and offsets is not None:
+            paths = self.basis.project_paths((phase + offsets).clamp(0, 1), others, dofs)
+        phase = phase.squeeze(-1)
+        return phase, self.basis.project(phase, weights, dofs), paths
 
     def phase(self, members: Tensor) -> Tensor:
         """Phase [..., E] of each of the members [..., E, n]."""
@@ -76,5 +101,4 @@ class BasisProjection(nn.Module):
 
     def at(self, members: Tensor, phase: Tensor) -> Tensor:
         """Projections [..., P, E, D] of members [..., E, n] at phases [..., P] that all of them share."""
-        at = phase.unsqueeze(-1).expand(*phase.shape, members.shape[-2])
-        return self.basis.project(at, members[..., 2:].unsqueeze(-3))
+        return self.basis.project_paths(phase.unsqueeze(-2), members[..., 2:]).transpose(-2, -3)

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch_ebip import functional
 from torch_ebip.filters.base import Filter
 from torch_ebip.filters.forecast import Forecast
+from torch_ebip.filters.interaction import BasisProjection
 from torch_ebip.filters.sequence import State
 from torch_ebip.noise.pair import FilterNoise
 
@@ -63,6 +64,13 @@ class MemberFilter(Filter):
             return phase
         members: Tensor = state.members
         return members[..., 0, 0] * torch.nan
+
+    def _project_rows(self, members: Tensor, rows: Tensor | None) -> Tensor:
+        """h [..., E, k] of members, for some DoFs int64 [k], ascending; None for all."""
+        if rows is not None and isinstance(self.observation, BasisProjection):
+            return self.observation.rows(members, rows.tolist())
+        projections: Tensor = self.observation(members)
+        return projections if rows is None else projections[..., rows]
 
     def _phase_or_none(self, state: State) -> Tensor | None:
         phase_of: Callable[[Tensor], Tensor] | None = getattr(self.observation, "phase", None)

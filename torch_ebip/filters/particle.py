@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from torch_ebip import functional
 from torch_ebip.basis.base import Basis
-from torch_ebip.filters.interaction import BasisProjection
 from torch_ebip.filters.members import MemberFilter
 from torch_ebip.filters.model import demonstration_states, interaction_model
 from torch_ebip.filters.priors import DemonstrationPrior, select_prior
@@ -147,12 +146,6 @@ class ParticleFilter(MemberFilter):
         any_observed = observed.any(-1)
         weights = torch.where(any_observed.unsqueeze(-1), joint - likelihood.unsqueeze(-1), state.log_weights)
         return ParticleState(state.members, weights), torch.where(any_observed, likelihood, 0)
-
-    def _project_rows(self, members: Tensor, rows: Tensor) -> Tensor:
-        if isinstance(self.observation, BasisProjection):
-            return self.observation.rows(members, rows.tolist())[0]
-        projections: Tensor = self.observation(members)
-        return projections[..., rows]
 
     def restrict(self, dofs: Tensor, thinning: int = 1) -> ParticleFilter:
         """See `Filter.restrict`."""

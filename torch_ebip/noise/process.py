@@ -128,7 +128,7 @@ class InteractionNoise(nn.Module):
 
     def forward(self, members: Tensor, dt: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Members [..., E, n] with noise for steps dt [...] seconds added."""
-        phase, weights = members.tensor_split((2,), dim=-1)
+        phase, weights = torch.split(members, [2, members.shape[-1] - 2], dim=-1)
         factor = self.phase.cholesky(dt).transpose(-1, -2) / math.sqrt(self.thinning)
         phase = phase + standard_normal(phase.shape, phase, generator) @ factor
         scale = self._weight_scale(dt)
