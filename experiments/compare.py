@@ -78,7 +78,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = _parser().parse_args(arguments)
     began = time.monotonic()
     tuning = TuningSettings(seed=options.seed, steps=options.steps)
-    count, scan = options.demonstrations, 48
+    count, scan = options.demonstrations, 24
     if options.quick:
         tuning = replace(tuning, steps=min(options.steps, 10), batch_size=8, validate_every=5)
         count, scan = min(count, 60), 8
@@ -175,7 +175,9 @@ def _parser() -> argparse.ArgumentParser:
         "(default: those of the paper; with --data each modality alone, and all)",
     )  # fmt: skip
     parser.add_argument("--members", type=int, metavar="E", help="of ensembles (default: N of the training part)")
-    parser.add_argument("--steps", type=int, default=100, help="gradient steps at most (default: 100)")
+    parser.add_argument(
+        "--steps", type=int, default=40, help="gradient steps of a tuned filter at most (default: 40)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of data, splits and draws (default: 0)")
     parser.add_argument("--quick", action="store_true", help="a small run of a few minutes, to see that all works")
     parser.add_argument("--workers", type=int, help="processes for folds (default: one a core)")

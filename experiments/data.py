@@ -9,7 +9,7 @@ from torch_ebip import Demonstrations, Layout
 
 FRACTIONS = (0.43, 0.82)
 """Shares of an interaction that the paper shows: before the ball is thrown, and on its way."""
-SAMPLES = 25
+SAMPLES = 14
 """How many samples of an interaction are used while tuning."""
 
 

@@ -34,7 +34,7 @@ from torch_ebip.tuning import Tuner, TuningResult, TuningSettings
 FACTORS = (1.0, 10.0, 100.0, 1000.0, 10000.0)
 """Coarse grid of factors on the closed-form R; the best one is refined by half-decades."""
 SHARPNESSES = (3.16, 10.0, 31.6)
-"""Of the evidence weights, tried with every half-decade of R around the best factor."""
+"""Of the evidence weights, tried with every half-decade of R up to the best factor."""
 
 
 class Start(NamedTuple):
@@ -141,14 +141,15 @@ def best_factor(
 
 
 def best_start(problem: Problem, settings: TuningSettings, interactions: int, factor: float, record: Path) -> Start:
-    """The start of `tunable` with the smallest loss, among half-decades of R about a factor, and `SHARPNESSES`.
+    """The start of `tunable` with the smallest loss, among half-decades of R up to a factor, and `SHARPNESSES`.
 
-    Other arguments: see `best_factor`.
+    The factor is the best one without evidence weights, which take over a part of what a large R is for. Other
+    arguments: see `best_factor`.
     """
     if not record.exists():
         order = torch.randperm(len(problem.primitive), generator=torch.Generator().manual_seed(settings.seed + 1))
         losses = []
-        for half, sharpness in product((-0.5, 0.0, 0.5), SHARPNESSES):
+        for half, sharpness in product((-1.0, -0.5, 0.0), SHARPNESSES):
             start = Start(float(f"{factor * 10**half:.4g}"), sharpness)
             loss = _tuner(problem, tunable(problem.primitive, start), settings).evaluate(order[:interactions])["loss"]
             losses.append({**start._asdict(), "loss": loss})

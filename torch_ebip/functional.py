@@ -282,7 +282,7 @@ def _through_gain(
     D = solved.shape[-1]
     weighted = innovation.weighted.transpose(-1, -2)
     if taper is None and inflation is None and 4 * n * D > 2 * n * E + 2 * E * D:
-        return _add_product(members, solved @ weighted, members)
+        return add_product(members, solved @ weighted, members)
     if inflation is not None:
         growth = inflation[..., None, None].expand(*members.shape[:-2], 1, 1)
         shares = members.new_full((E,), 1 / E) if weights is None else weights
@@ -295,11 +295,11 @@ def _through_gain(
         factor = taper.state.transpose(-1, -2)
         factor = factor if innovation.rows is None else factor.index_select(-2, innovation.rows)
         cross = torch.cat([cross[..., :D, :] * factor, cross[..., D:, :]], dim=-2)
-    return _add_product(members if inflation is None else growth * members, solved, cross)
+    return add_product(members if inflation is None else growth * members, solved, cross)
 
 
-def _add_product(base: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """base + a @ b in one pass over the base."""
+def add_product(base: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    """base [..., m, n] + a [..., m, k] @ b [..., k, n] in one pass over the base."""
     if base.ndim == 2:
         return torch.addmm(base, a, b)
     flat = (part.expand(*base.shape[:-2], *part.shape[-2:]).reshape(-1, *part.shape[-2:]) for part in (base, a, b))

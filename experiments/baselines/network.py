@@ -31,7 +31,7 @@ class RecurrentSettings:
         seed: of the networks, the training and the draws.
     """
 
-    networks: int = 3
+    networks: int = 2
     hidden: int = 64
     steps_shown: int = 25
     dropout: float = 0.3

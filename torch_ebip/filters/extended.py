@@ -20,7 +20,7 @@ from torch_ebip.filters.forecast import Forecast
 from torch_ebip.filters.interaction import BasisProjection, ConstantVelocityPhase
 from torch_ebip.filters.model import demonstration_states, interaction_model
 from torch_ebip.filters.priors import MomentPrior
-from torch_ebip.functional import FactorisationError, cholesky
+from torch_ebip.functional import FactorisationError, add_product, cholesky
 from torch_ebip.noise.pair import FilterNoise
 from torch_ebip.noise.process import InteractionNoise
 from torch_ebip.primitive import InteractionPrimitive
@@ -31,7 +31,7 @@ class GaussianState(NamedTuple):
 
     Attributes:
         mean: [..., n].
-        covariance: [..., n, n], symmetric.
+        covariance: [..., n, n], symmetric to rounding.
     """
 
     mean: Tensor
@@ -79,7 +79,8 @@ class ExtendedFilter(Filter):
         row = slope * (covariance[..., 0, :] + dt_column * covariance[..., 1, :])
         corner = slope.squeeze(-1) * (row[..., 0] + dt * row[..., 1])
         row = torch.cat([corner.unsqueeze(-1), row[..., 1:]], dim=-1)
-        moved = covariance.clone()
+        # What rounding made asymmetric does not pile up.
+        moved = torch.lerp(covariance, covariance.transpose(-1, -2), 0.5)
         moved[..., 0, :] = row
         moved[..., :, 0] = row
         phase, weights = self._process.covariance(dt)
@@ -114,10 +115,11 @@ class ExtendedFilter(Filter):
         gain = torch.cholesky_solve(cross.transpose(-1, -2) / scale.unsqueeze(-1), factor) / scale.unsqueeze(-1)
         gain = gain.transpose(-1, -2)
         mean = mean + (gain @ residual.unsqueeze(-1)).squeeze(-1)
-        # (I - KH) Sigma (I - KH)' + K R K' with M = (I - KH) Sigma is M - (M H' - K R) K'.
-        left = covariance - gain @ cross.transpose(-1, -2)
-        joseph = left - (by_jacobian(left) - gain * R.unsqueeze(-2)) @ gain.transpose(-1, -2)
-        joseph = 0.5 * (joseph + joseph.transpose(-1, -2))
+        # Joseph's (I - KH) Sigma (I - KH)' + K R K' is Sigma - K B' - B K' with B = Sigma H' - K S / 2: one product.
+        half = cross - 0.5 * gain @ (innovation + torch.diag_embed(R))
+        pair = torch.cat([gain, half], dim=-1)
+        other = torch.cat([half, gain], dim=-1)
+        joseph = add_product(covariance, -pair, other.transpose(-1, -2))
         whitened = torch.linalg.solve_triangular(factor, (residual / scale).unsqueeze(-1), upper=False).squeeze(-1)
         log_scale = factor.diagonal(dim1=-2, dim2=-1).log() + scale.log()
         terms = -0.5 * whitened.square() - log_scale - 0.5 * math.log(2 * math.pi)

@@ -41,11 +41,13 @@ class ConstantVelocityPhase(nn.Module):
 
     def forward(self, members: Tensor, dt: Tensor) -> Tensor:
         """Members [..., E, n] after dt [...] seconds."""
-        phase, velocity, weights = split_state(members)
-        phase = phase + velocity * dt[..., None, None]
+        phase = members[..., 0] + members[..., 1] * dt[..., None]
         excess = phase - phase.clamp(0, 1)
         phase = phase - excess * excess.abs() / (self.overrun + excess.abs())
-        return torch.cat([phase, velocity, weights], dim=-1)
+        # A copy with one column exchanged costs a third of putting columns together.
+        moved = members.clone()
+        moved[..., 0] = phase
+        return moved
 
     def slope(self, mean: Tensor, dt: Tensor) -> Tensor:
         """Derivative [...] of the next phase by the present one at states [..., n]: 1 within the interval."""

@@ -128,10 +128,11 @@ class InteractionNoise(nn.Module):
 
     def forward(self, members: Tensor, dt: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Members [..., E, n] with noise for steps dt [...] seconds added."""
-        phase, weights = torch.split(members, [2, members.shape[-1] - 2], dim=-1)
         factor = self.phase.cholesky(dt).transpose(-1, -2) / math.sqrt(self.thinning)
-        phase = phase + standard_normal(phase.shape, phase, generator) @ factor
+        moved = members.clone()
+        moved[..., :2] += standard_normal(members[..., :2].shape, members, generator) @ factor
         scale = self._weight_scale(dt)
         if scale is not None:
-            weights = weights + standard_normal(weights.shape, weights, generator) * scale.unsqueeze(-2)
-        return torch.cat([phase, weights], dim=-1)
+            draws = standard_normal(members[..., 2:].shape, members, generator)
+            moved[..., 2:] += draws * scale.unsqueeze(-2)
+        return moved
