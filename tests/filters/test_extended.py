@@ -186,29 +186,29 @@ def test_it_agrees_with_ebip_in_the_linear_limit() -> None:
     torch.testing.assert_close(mine.variance, theirs.variance, atol=1e-10, rtol=1e-8)
 
 
-def test_float32_stays_symmetric_and_positive_over_a_thousand_steps() -> None:
-    """Closed-form R, a prior of rank 23 in 30 dimensions, where (I - KH) Sigma loses positivity."""
+def test_float32_stays_symmetric_and_positive() -> None:
+    """Closed-form R, a prior of rank 23 in 30 dimensions, 200 steps; (I - KH) Sigma drifts from symmetry here."""
     made = bip(small_primitive())
-    y = slow_interaction(1000).float()
+    y = slow_interaction(200).float()
     state = made.initial_state()
     scale = state.covariance.diagonal()[1:].sqrt()
 
-    def smallest(covariance: torch.Tensor) -> float:
-        """Smallest eigenvalue in units of the prior."""
-        symmetric = 0.5 * (covariance + covariance.T)[1:, 1:]
-        return torch.linalg.eigvalsh((symmetric / scale / scale[:, None]).double())[0].item()
+    def in_units_of_the_prior(covariance: torch.Tensor) -> torch.Tensor:
+        return covariance[1:, 1:] / scale / scale[:, None]
+
+    def asymmetry(covariance: torch.Tensor) -> float:
+        return in_units_of_the_prior(covariance - covariance.T).abs().max().item()
 
     with torch.no_grad():
-        covariance = made(y, HUMAN.expand(1000, 5), dt=1e-3, project=False).state.covariance
+        ours = made(y, HUMAN.expand(200, 5), dt=5e-3, project=False).state.covariance
         R = torch.diag(made.noise.measurement()[:3].square())
         G, Q = torch.eye(32), torch.zeros(32, 32)
-        G[0, 1] = 1e-3
-        Q[:2, :2] = made.noise.process.covariance(torch.tensor(1e-3))[0]
-        for t in range(1000):
-            mean, plain = state
+        G[0, 1] = 5e-3
+        Q[:2, :2] = made.noise.process.covariance(torch.tensor(5e-3))[0]
+        mean, plain = state
+        for t in range(200):
             if t:
-                mean = mean + G[0, 1] * mean[1] * torch.eye(32)[0]
-                plain = G @ plain @ G.T + Q
+                mean, plain = G @ mean, G @ plain @ G.T + Q
             H = torch.zeros(3, 32)
             for d in range(3):
                 weights = slice(2 + 6 * d, 8 + 6 * d)
@@ -216,11 +216,11 @@ def test_float32_stays_symmetric_and_positive_over_a_thousand_steps() -> None:
                 H[d, 0] = BSplineBasis(6).derivative(mean[0]) @ mean[weights]
             K = plain @ H.T @ torch.linalg.inv(H @ plain @ H.T + R)
             expected = made.project(GaussianState(mean, plain))[:3]
-            state = GaussianState(mean + K @ (y[t, :3] - expected), plain - K @ H @ plain)
-    asymmetry = (covariance - covariance.T)[1:, 1:] / scale / scale[:, None]
-    assert asymmetry.abs().max() < 1e-6
-    assert smallest(covariance) > -1e-6
-    assert smallest(state.covariance) < -1e-5
+            mean, plain = mean + K @ (y[t, :3] - expected), plain - K @ H @ plain
+    assert asymmetry(ours) < 1e-7
+    assert asymmetry(plain) > 1e-5
+    symmetric = 0.5 * (ours + ours.T)
+    assert torch.linalg.eigvalsh(in_units_of_the_prior(symmetric).double())[0] > -1e-6
 
 
 def test_the_slope_of_the_phase_is_its_derivative() -> None:
