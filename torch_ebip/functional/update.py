@@ -20,13 +20,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-
-class FactorisationError(ValueError):
-    """A covariance of observations that is not positive definite; ``dofs`` are the first failing columns."""
-
-    def __init__(self, message: str, dofs: list[int]) -> None:
-        super().__init__(message)
-        self.dofs = dofs
+from torch_ebip.functional.linear import add_product, cholesky
+from torch_ebip.functional.moments import ensemble_mean, member_shares
 
 
 class Taper(NamedTuple):
@@ -139,64 +134,6 @@ def square_root_update(
     return updated, _log_likelihood(innovation)
 
 
-def ensemble_mean(members: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Mean [..., n] of members [..., E, n] with weights [..., E] that sum to 1; default: equal ones."""
-    return members.mean(-2) if weights is None else (weights.unsqueeze(-2) @ members).squeeze(-2)
-
-
-def ensemble_variance(members: Tensor, weights: Tensor | None = None, unbiased: bool = True) -> Tensor:
-    """Variance [..., n] of members [..., E, n] with weights [..., E]; default: equal ones.
-
-    Unbiased for members that are draws; otherwise that of the members as a distribution of their own.
-    """
-    anomalies = members - ensemble_mean(members, weights).unsqueeze(-2)
-    return (anomalies.square() * _shares(members, weights, unbiased)).sum(-2)
-
-
-def ensemble_covariance(members: Tensor, weights: Tensor | None = None, unbiased: bool = True) -> Tensor:
-    """Covariance [..., n, n] of members [..., E, n] with weights [..., E]; otherwise as `ensemble_variance`."""
-    anomalies = members - ensemble_mean(members, weights).unsqueeze(-2)
-    return (anomalies * _shares(members, weights, unbiased)).transpose(-1, -2) @ anomalies
-
-
-def _shares(members: Tensor, weights: Tensor | None, unbiased: bool = True) -> Tensor:
-    """What each member's squared anomaly counts in a covariance, [..., E, 1] or [1]."""
-    if weights is None:
-        return members.new_tensor([1 / (members.shape[-2] - unbiased)])
-    if not unbiased:
-        return weights.unsqueeze(-1)
-    return (weights / (1 - weights.square().sum(-1, keepdim=True))).unsqueeze(-1)
-
-
-def systematic_resample(log_weights: Tensor, u: Tensor) -> Tensor:
-    """Ancestors of E particles by systematic resampling (Kitagawa 1996): one uniform draw for all.
-
-    Particle j has floor(E w_j) or ceil(E w_j) offspring, E w_j in the mean; ancestors come in ascending order.
-
-    Args:
-        log_weights: [..., E], need not be normalised; at least one of them finite.
-        u: [...], uniform in [0, 1).
-
-    Returns:
-        int64 [..., E], indices of the particles that the new ones are copies of.
-
-    Raises:
-        ValueError: shapes that do not fit, or weights of which none is positive.
-    """
-    if u.shape != log_weights.shape[:-1]:
-        raise ValueError(
-            f"u must have one number for each row of log_weights, {list(log_weights.shape[:-1])}, got {list(u.shape)}"
-        )
-    E = log_weights.shape[-1]
-    cumulative = torch.softmax(log_weights, dim=-1).cumsum(-1)
-    if not bool(cumulative.isfinite().all()):
-        raise ValueError("log_weights hold NaN, or a row without any positive weight")
-    positions = (u.unsqueeze(-1) + torch.arange(E, dtype=u.dtype, device=u.device)) / E
-    # Rounding can leave the last sum below 1 and the last position above it.
-    cumulative = cumulative / cumulative[..., -1:]
-    return torch.searchsorted(cumulative.contiguous(), positions.contiguous(), right=True).clamp(max=E - 1)
-
-
 def _check(members: Tensor, projections: Tensor, y: Tensor, noise_cholesky: Tensor, observed: Tensor | None) -> None:
     E, D = projections.shape[-2:]
     if members.shape[-2] != E or E < 2:
@@ -240,7 +177,7 @@ def _innovation(
         noise = torch.where(observed.unsqueeze(-1), noise, 0)
         y = torch.where(observed, y, 0)
         mean = torch.where(observed, mean, 0)
-    shares = _shares(projections, weights)
+    shares = member_shares(projections, weights)
     variance = (anomalies.square() * shares).sum(-2) + noise.square().sum(-1)
     if observed is not None:
         variance = torch.where(observed, variance, 1)
@@ -298,14 +235,6 @@ def _through_gain(
     return add_product(members if inflation is None else growth * members, solved, cross)
 
 
-def add_product(base: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """base [..., m, n] + a [..., m, k] @ b [..., k, n] in one pass over the base."""
-    if base.ndim == 2:
-        return torch.addmm(base, a, b)
-    flat = (part.expand(*base.shape[:-2], *part.shape[-2:]).reshape(-1, *part.shape[-2:]) for part in (base, a, b))
-    return torch.baddbmm(*flat).reshape(base.shape)
-
-
 def _log_likelihood(innovation: _Innovation) -> Tensor:
     whitened = torch.linalg.solve_triangular(
         innovation.cholesky, innovation.residual.unsqueeze(-1), upper=False
@@ -320,33 +249,3 @@ def _log_likelihood(innovation: _Innovation) -> Tensor:
 
 def _nothing_observed(members: Tensor, projections: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     return members, torch.zeros_like(projections[..., 0, 0] + torch.where(y.isnan(), 0, y)[..., 0])
-
-
-def cholesky(matrix: Tensor, rows: Tensor | None = None) -> Tensor:
-    """Lower Cholesky factor of covariances [..., D, D] of observations, or an error that says what to do.
-
-    Args:
-        matrix: symmetric positive definite.
-        rows: int64 [D], which DoFs these are, for the error; default: the first D.
-
-    Raises:
-        FactorisationError: names the batch entries and the DoFs.
-    """
-    factor: Tensor
-    factor, info = torch.linalg.cholesky_ex(matrix)
-    if bool(info.any()):
-        entries = info.nonzero().tolist() if info.ndim else []
-        minors = sorted(set(info[info > 0].reshape(-1).tolist()))
-        dofs = [m - 1 if rows is None else int(rows[m - 1]) for m in minors]
-        finite = bool(matrix.isfinite().all())
-        raise FactorisationError(
-            f"a covariance of observations cannot be factored: batch entries {entries[:8] or '[the only one]'}, "
-            f"first failing at DoF {dofs[:8]}. "
-            + (
-                "It is not positive definite: raise the floor of the measurement noise, or use float64."
-                if finite
-                else "It holds NaN or infinite values: look at the measurements and at the members."
-            ),
-            dofs,
-        )
-    return factor
