@@ -44,6 +44,7 @@ def results_figure(results: Mapping[str, Any], panels: Sequence[tuple[str, str |
     """Mean and standard error of every method in every cell, a panel for each (metric, modality)."""
     methods = list(dict.fromkeys(row["method"] for row in results["rows"]))
     figure, axes = plt.subplots(len(panels), 1, figsize=(9, 2.6 * len(panels)), squeeze=False, layout="constrained")
+    step, handles = min(0.14, 0.8 / len(methods)), {}
     for axis, (metric, modality) in zip(axes[:, 0], panels, strict=True):
         rows = [row for row in results["rows"] if (row["metric"], row["modality"]) == (metric, modality)]
         if not rows:
@@ -54,19 +55,25 @@ def results_figure(results: Mapping[str, Any], panels: Sequence[tuple[str, str |
             mine = [row for row in rows if row["method"] == method]
             if not mine:
                 continue
-            at = [cells.index((row["subset"], row["observed"])) + 0.14 * (i - (len(methods) - 1) / 2) for row in mine]
+            at = [cells.index((row["subset"], row["observed"])) + step * (i - (len(methods) - 1) / 2) for row in mine]
             errors = [row["standard_error"] or 0.0 for row in mine]
             means = [row["mean"] for row in mine]
-            axis.errorbar(at, means, errors, fmt="o", ms=4, capsize=2, color=colour(method), label=method)
+            drawn = axis.errorbar(at, means, errors, fmt="o", ms=4, capsize=2, color=colour(method), label=method)
+            handles.setdefault(method, drawn)
         axis.set_xticks(range(len(cells)), [_label(*cell) for cell in cells], fontsize=8)
         unit = "" if rows[0]["unit"] == "1" else f" [{rows[0]['unit']}]"
         axis.set_ylabel(f"{metric}{'' if modality is None else ' ' + modality}{unit}", fontsize=9)
         axis.grid(axis="y", alpha=0.3)
         if metric == "coverage_95":
             axis.axhline(0.95, color="0.3", lw=0.8, ls="--")
+        elif max(row["mean"] for row in rows) > 10 * min(row["mean"] for row in rows) > 0:
+            axis.set_yscale("log")
         else:
             axis.set_ylim(bottom=0)
-    axes[0, 0].legend(ncols=5, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, 1.25), frameon=False)
+        for edge in range(len(cells) - 1):
+            axis.axvline(edge + 0.5, color="0.85", lw=0.6)
+    shown = [method for method in methods if method in handles]
+    figure.legend([handles[m] for m in shown], shown, ncols=5, fontsize=8, loc="outside upper center", frameon=False)
     axes[-1, 0].set_xlabel("observed modalities and share of the interaction")
     return figure
 
