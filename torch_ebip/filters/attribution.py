@@ -34,8 +34,8 @@ def affine_coefficients(demonstrations: Tensor, weights: Tensor) -> Tensor:
     departure = (weights.double() - mean) / spread
     rounding = torch.finfo(demonstrations.dtype).eps * max(anomalies.shape)
     coefficients = departure @ torch.linalg.pinv(anomalies, rtol=rounding)
-    outside = (coefficients @ anomalies - departure).square().mean(-1).sqrt().max()
-    if not bool(outside < 0.01 * max(1.0, float(departure.square().mean(-1).sqrt().max()))):
+    outside = (coefficients @ anomalies - departure).detach().square().mean(-1).sqrt().max()
+    if not bool(outside < 0.01 * max(1.0, float(departure.detach().square().mean(-1).sqrt().max()))):
         raise ValueError(
             f"weights lie outside the span of the demonstrations by {float(outside):.2g} of their standard deviations"
         )
