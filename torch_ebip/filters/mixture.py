@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_ebip.draws import standard_normal
-from torch_ebip.filters.priors import check_members
+from torch_ebip.filters.priors import check_members, check_states
 
 
 class MixturePrior(nn.Module):
@@ -33,8 +33,7 @@ class MixturePrior(nn.Module):
 
     def __init__(self, states: Tensor, responsibilities: Tensor) -> None:
         super().__init__()
-        if states.ndim != 2 or len(states) < 2:
-            raise ValueError(f"a prior needs at least 2 states [N, n], got {tuple(states.shape)}")
+        check_states(states)
         if responsibilities.ndim != 2 or len(responsibilities) != len(states):
             raise ValueError(f"responsibilities must be [{len(states)}, K], got {tuple(responsibilities.shape)}")
         self.register_buffer("states", states)

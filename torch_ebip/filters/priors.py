@@ -21,8 +21,7 @@ class DemonstrationPrior(nn.Module):
 
     def __init__(self, states: Tensor) -> None:
         super().__init__()
-        if states.ndim != 2 or len(states) < 2:
-            raise ValueError(f"a prior needs at least 2 states [N, n], got {tuple(states.shape)}")
+        check_states(states)
         self.register_buffer("states", states)
 
     def forward(
@@ -78,8 +77,7 @@ class MomentPrior(nn.Module):
 
     def __init__(self, states: Tensor, shrinkage: float = 0.0) -> None:
         super().__init__()
-        if states.ndim != 2 or len(states) < 2:
-            raise ValueError(f"a prior needs at least 2 states [N, n], got {tuple(states.shape)}")
+        check_states(states)
         if not 0 <= shrinkage <= 1:
             raise ValueError(f"shrinkage must lie between 0 and 1, got {shrinkage}")
         self.register_buffer("states", states)
@@ -115,6 +113,12 @@ class MomentPrior(nn.Module):
     def select(self, columns: Tensor) -> MomentPrior:
         """The prior of some entries of the state, int64 [k]."""
         return MomentPrior(self.states[:, columns], self.shrinkage)
+
+
+def check_states(states: Tensor) -> None:
+    """ValueError unless states are [N, n], N at least 2."""
+    if states.ndim != 2 or len(states) < 2:
+        raise ValueError(f"a prior needs at least 2 states [N, n], got {tuple(states.shape)}")
 
 
 def check_members(members: Tensor, count: int) -> None:
