@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
+import torch
 from torch import Tensor, nn
 
 
@@ -32,11 +33,16 @@ class Basis(nn.Module, ABC):
     def evaluate(self, phase: Tensor) -> tuple[Tensor, Tensor]:
         """Values and slopes d/dphi, [..., n_features] each, at phases [...] within [0, 1]."""
 
+    def by_function(self, phase: Tensor) -> Tensor:
+        """`forward` the other way round, [..., n_features, E], at phases [..., E] known to lie within [0, 1]."""
+        return self.evaluate(phase)[0].transpose(-1, -2).contiguous()
+
     def forward(self, phase: Tensor) -> Tensor:
         """Features [..., n_features] at phases [...] (any real number)."""
         inside, excess = _split(phase)
         values, slopes = self.evaluate(inside)
-        return values + slopes * (excess / (1 + excess.abs() / self.margin)).unsqueeze(-1)
+        softsign = (excess / (excess.abs() + self.margin)).unsqueeze(-1)
+        return torch.addcmul(values, slopes, softsign, value=self.margin)
 
     def derivative(self, phase: Tensor) -> Tensor:
         """d features / d phase, [..., n_features], at phases [...]; the exact derivative of `forward`."""

@@ -23,7 +23,10 @@ class CentredBasis(Basis):
     """
 
     share_of_spacing = 1.0
-    centres: Tensor
+    stretch = 1.0
+    """The curve's unit in widths."""
+    steepness: Tensor
+    offsets: Tensor
 
     def __init__(self, n_features: int, width: float | None = None, offset: bool = False) -> None:
         super().__init__(n_features)
@@ -36,20 +39,42 @@ class CentredBasis(Basis):
             raise ValueError(f"{name}: width must be a positive phase, got {width}")
         middle = torch.tensor([0.5], dtype=torch.float64)
         centres = middle if count == 1 else torch.linspace(0, 1, count, dtype=torch.float64)
-        self.register_buffer("centres", centres, persistent=False)
+        # Tensors: arithmetic with a Python number first makes one of it, which costs more than small arithmetic.
+        steepness = torch.tensor(1 / (self.stretch * self.width), dtype=torch.float64)
+        self.register_buffer("steepness", steepness, persistent=False)
+        self.register_buffer("offsets", -centres * steepness, persistent=False)
 
     @abstractmethod
-    def curve(self, distance: Tensor) -> tuple[Tensor, Tensor]:
-        """The curve and its slope, both of the shape of the distances from its centre in widths."""
+    def curve(self, distance: Tensor) -> Tensor:
+        """The curve at distances from its centre, in units of ``stretch`` widths, of their shape."""
+
+    @abstractmethod
+    def slope(self, distance: Tensor, values: Tensor) -> Tensor:
+        """Its derivative, where its values are known already."""
 
     def evaluate(self, phase: Tensor) -> tuple[Tensor, Tensor]:
         """Values and slopes; see `Basis.evaluate`."""
-        values, slopes = self.curve((phase.unsqueeze(-1) - self.centres.to(phase)) / self.width)
-        slopes = slopes / self.width
+        steepness, offsets = self._line(phase)
+        distance = torch.addcmul(offsets, phase.unsqueeze(-1), steepness)
+        values = self.curve(distance)
+        slopes = self.slope(distance, values) * steepness
         if self.offset:
             one = torch.ones_like(values[..., :1])
             return torch.cat([values, one], dim=-1), torch.cat([slopes, torch.zeros_like(one)], dim=-1)
         return values, slopes
+
+    def by_function(self, phase: Tensor) -> Tensor:
+        """See `Basis.by_function`."""
+        steepness, offsets = self._line(phase)
+        values = self.curve(torch.addcmul(offsets.unsqueeze(-1), phase.unsqueeze(-2), steepness))
+        return torch.cat([values, torch.ones_like(values[..., :1, :])], dim=-2) if self.offset else values
+
+    def _line(self, phase: Tensor) -> tuple[Tensor, Tensor]:
+        """Slope and intercepts of the curve's argument as a function of phase."""
+        steepness, offsets = self.steepness, self.offsets
+        if offsets.dtype != phase.dtype or offsets.device != phase.device:
+            return steepness.to(phase), offsets.to(phase)
+        return steepness, offsets
 
     def extra_repr(self) -> str:
         """The settings; see `Basis.extra_repr`."""

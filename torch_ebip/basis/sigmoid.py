@@ -13,7 +13,10 @@ class SigmoidBasis(CentredBasis):
 
     share_of_spacing = 0.5
 
-    def curve(self, distance: Tensor) -> tuple[Tensor, Tensor]:
+    def curve(self, distance: Tensor) -> Tensor:
         """See `CentredBasis.curve`."""
-        values = torch.sigmoid(distance)
-        return values, values * (1 - values)
+        return torch.sigmoid(distance)
+
+    def slope(self, distance: Tensor, values: Tensor) -> Tensor:
+        """See `CentredBasis.slope`."""
+        return values * (1 - values)

@@ -57,6 +57,11 @@ class StackedBasis(nn.Module):
         return tuple(self.unique[i] for i in self._basis_of_dof)  # type: ignore[misc]
 
     @property
+    def families(self) -> list[Basis]:
+        """Each different basis once."""
+        return list(self.unique)  # type: ignore[arg-type]
+
+    @property
     def n_dofs(self) -> int:
         """D."""
         return len(self._basis_of_dof)
@@ -93,11 +98,11 @@ class StackedBasis(nn.Module):
         Returns:
             [..., k], units of the DoFs.
         """
-        return self._project([basis(phase) for basis in self._families()], weights, dofs)
+        return self._project([basis(phase) for basis in self.families], weights, dofs)
 
     def project_derivative(self, phase: Tensor, weights: Tensor) -> Tensor:
         """dh/dphi, shapes as `project`: the first column of the paper's Jacobian (equation of H_t)."""
-        return self._project([basis.derivative(phase) for basis in self._families()], weights, None)
+        return self._project([basis.derivative(phase) for basis in self.families], weights, None)
 
     def project_rows(self, phase: Tensor, matrix: Tensor) -> Tensor:
         """h(phi, row) of every row of a matrix: with a covariance of the weights, the product with dh/dw'.
@@ -111,7 +116,7 @@ class StackedBasis(nn.Module):
         Returns:
             [..., m, D].
         """
-        features = [basis(phase) for basis in self._families()]
+        features = [basis(phase) for basis in self.families]
         parts = []
         for run, block in zip(self._runs, self._blocks(matrix), strict=True):
             shape = (*block.shape[:-1], run.dofs.stop - run.dofs.start)
@@ -130,7 +135,7 @@ class StackedBasis(nn.Module):
         Returns:
             [..., P, k].
         """
-        features = [basis(phase) for basis in self._families()]
+        features = [basis(phase) for basis in self.families]
         parts = []
         for run, block in zip(self._runs, self._blocks(weights), strict=True):
             wanted = run.wanted(dofs)
@@ -151,7 +156,7 @@ class StackedBasis(nn.Module):
         Returns:
             [..., P, D], squared units of the DoFs.
         """
-        features = [basis(phase) for basis in self._families()]
+        features = [basis(phase) for basis in self.families]
         parts = []
         for run in self._runs:
             functions = features[run.basis]
@@ -161,9 +166,6 @@ class StackedBasis(nn.Module):
             own = blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)
             parts.append(torch.einsum("...pa,...kab,...pb->...pk", functions, own, functions))
         return torch.cat(parts, dim=-1)
-
-    def _families(self) -> list[Basis]:
-        return list(self.unique)  # type: ignore[arg-type]
 
     def _project(self, features: Sequence[Tensor], weights: Tensor, dofs: Sequence[int] | None) -> Tensor:
         parts = []

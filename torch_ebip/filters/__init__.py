@@ -7,6 +7,7 @@ from torch_ebip.filters.evidence import Evidence, EvidenceWeighting
 from torch_ebip.filters.extended import ExtendedFilter, GaussianState, bip
 from torch_ebip.filters.forecast import Forecast
 from torch_ebip.filters.interaction import BasisProjection, ConstantVelocityPhase
+from torch_ebip.filters.live import LiveFilter
 from torch_ebip.filters.localisation import Localisation
 from torch_ebip.filters.mixture import MixturePrior
 from torch_ebip.filters.particle import ParticleFilter, ParticleState, particle_filter
@@ -25,6 +26,7 @@ __all__ = [
     "Forecast",
     "GaussianPrior",
     "GaussianState",
+    "LiveFilter",
     "Localisation",
     "MixturePrior",
     "MomentPrior",

@@ -41,13 +41,16 @@ class ConstantVelocityPhase(nn.Module):
 
     def forward(self, members: Tensor, dt: Tensor) -> Tensor:
         """Members [..., E, n] after dt [...] seconds."""
-        phase = members[..., 0] + members[..., 1] * dt[..., None]
-        excess = phase - phase.clamp(0, 1)
-        phase = phase - excess * excess.abs() / (self.overrun + excess.abs())
         # A copy with one column exchanged costs a third of putting columns together.
         moved = members.clone()
-        moved[..., 0] = phase
+        moved[..., 0] = self.hold(members[..., 0] + members[..., 1] * dt[..., None])
         return moved
+
+    def hold(self, phase: Tensor) -> Tensor:
+        """Phases [...] with what lies beyond the interval drawn in: e becomes e overrun / (overrun + |e|)."""
+        inside = phase.clamp(0, 1)
+        excess = phase - inside
+        return torch.addcdiv(inside, excess, excess.abs() + self.overrun, value=self.overrun)
 
     def slope(self, mean: Tensor, dt: Tensor) -> Tensor:
         """Derivative [...] of the next phase by the present one at states [..., n]: 1 within the interval."""

@@ -55,7 +55,8 @@ def interaction_model(
         weight_noise: rate of the weights' random walk at the start, 1/sqrt(s), see `WeightNoise`; default: none.
         context: functions of phase for an R that depends on it; see `MeasurementNoise`.
     """
-    layout, basis, weights = primitive.layout, copy.deepcopy(primitive.basis), primitive.weights
+    layout, weights = primitive.layout, primitive.weights
+    basis = copy.deepcopy(primitive.basis).to(weights)
     modality_of_dof = layout.modality_of_dof.to(weights.device)
     walk = None
     if weight_noise is not None:

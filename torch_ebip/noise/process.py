@@ -120,6 +120,10 @@ class InteractionNoise(nn.Module):
         weights = self._weight_scale(dt)
         return self.phase.covariance(dt) / self.thinning, None if weights is None else weights.square()
 
+    def phase_factor(self, dt: Tensor) -> Tensor:
+        """Lower factor [..., 2, 2] of the covariance of phase and phase velocity for steps dt [...] seconds."""
+        return self.phase.cholesky(dt) / math.sqrt(self.thinning)
+
     def _weight_scale(self, dt: Tensor) -> Tensor | None:
         if self.weights is None:
             return None
@@ -128,7 +132,7 @@ class InteractionNoise(nn.Module):
 
     def forward(self, members: Tensor, dt: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Members [..., E, n] with noise for steps dt [...] seconds added."""
-        factor = self.phase.cholesky(dt).transpose(-1, -2) / math.sqrt(self.thinning)
+        factor = self.phase_factor(dt).transpose(-1, -2)
         moved = members.clone()
         moved[..., :2] += standard_normal(members[..., :2].shape, members, generator) @ factor
         scale = self._weight_scale(dt)

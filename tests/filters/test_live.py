@@ -1,0 +1,178 @@
+"""The live path gives the numbers of the differentiable one, whatever it keeps and whatever it puts off."""
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.conftest import interactions, small_primitive
+from torch_ebip import BSplineBasis, EnsembleFilter, GaussianBasis, InteractionPrimitive, StackedBasis, ebip
+from torch_ebip.filters import LiveFilter
+from torch_ebip.filters.span import SpanMembers
+
+HUMAN = torch.tensor([True, True, True, False, False])
+OPTIONS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "square root": {"square_root": True},
+    "inflation": {"inflation": 1.01},
+    "evidence": {"weigh": True},
+    "context": {"context": BSplineBasis(4)},
+    "all": {"square_root": True, "inflation": 1.02, "weigh": True, "context": BSplineBasis(4)},
+}
+
+
+def sequences(length: int = 30) -> tuple[Tensor, Tensor]:
+    """Three interactions [3, T, 5] with the same gaps: single DoFs, whole samples, another order."""
+    values, _ = interactions(3, seed=7, dtype=torch.float64).pad()
+    observed = HUMAN.expand(3, length, 5).clone()
+    observed[:, 4:8, 0] = False
+    observed[:, 5, 1:] = False
+    observed[:, 9:13] = False
+    observed[:, 14, 1] = False
+    return torch.nan_to_num(values[:, :length]), observed
+
+
+def run(live: LiveFilter, y: Tensor, observed: Tensor) -> Tensor:
+    """Log-likelihoods [..., T] of a sequence."""
+    likelihoods = []
+    for t in range(y.shape[-2]):
+        if t:
+            live.predict()
+        likelihoods.append(live.update(y[..., t, :], observed[..., t, :]))
+    return torch.stack(likelihoods, -1)
+
+
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
+@pytest.mark.parametrize("batch", [(), (3,)], ids=["single", "batch"])
+@pytest.mark.parametrize(("members", "sensors"), [(None, None), (10, HUMAN), (4, HUMAN)])
+def test_the_numbers_of_the_filter(
+    options: dict[str, Any], batch: tuple[int, ...], members: int | None, sensors: Tensor | None
+) -> None:
+    """With 4 or 10 members the 12 weights of the arm are behind the transform, with 24 they are not."""
+    filter = ebip(small_primitive(torch.float64), members, **options)
+    for name, parameter in filter.named_parameters():  # as tuning would leave it
+        generator = torch.Generator().manual_seed(len(name))
+        parameter.data += 0.1 * torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
+    y, observed = sequences()
+    y, observed = (y, observed) if batch else (y[0], observed[0])
+    trace = filter(y, observed, generator=torch.Generator().manual_seed(1))
+    live = LiveFilter(filter, sensors, batch, generator=torch.Generator().manual_seed(1))
+    torch.testing.assert_close(run(live, y, observed), trace.log_likelihood)
+    torch.testing.assert_close(live.state.members, trace.state.members)
+    torch.testing.assert_close(live.phase, trace.phase[..., -1])
+    if trace.state.evidence is not None:
+        for mine, theirs in zip(live.state.evidence, trace.state.evidence, strict=True):
+            torch.testing.assert_close(mine, theirs)
+    expected = filter.forecast(trace.state)
+    for dofs in (None, ~HUMAN, torch.tensor([False, True, False, True, False])):
+        forecast = live.forecast(dofs=dofs)
+        chosen = slice(None) if dofs is None else dofs
+        torch.testing.assert_close(forecast.mean, expected.mean[..., chosen])
+        torch.testing.assert_close(forecast.variance, expected.variance[..., chosen])
+        torch.testing.assert_close(forecast.phase, expected.phase)
+
+
+def test_bases_that_differ_between_modalities() -> None:
+    bases = [BSplineBasis(6), BSplineBasis(6), GaussianBasis(7), GaussianBasis(5), BSplineBasis(6)]
+    primitive = InteractionPrimitive.fit(interactions(24, dtype=torch.float64), StackedBasis(bases))
+    filter = ebip(primitive, 5)
+    y, observed = sequences()
+    trace = filter(y[0], observed[0], generator=torch.Generator().manual_seed(1))
+    live = LiveFilter(filter, HUMAN, generator=torch.Generator().manual_seed(1))
+    torch.testing.assert_close(run(live, y[0], observed[0]), trace.log_likelihood)
+    torch.testing.assert_close(live.state.members, trace.state.members)
+
+
+def test_steps_of_changing_length_and_chosen_members() -> None:
+    filter, chosen = ebip(small_primitive(torch.float64)), torch.tensor([3, 1, 4, 15, 9, 2])
+    y, observed = sequences()
+    generator = torch.Generator().manual_seed(1)
+    live = LiveFilter(filter, HUMAN, members=chosen, generator=torch.Generator().manual_seed(1))
+    state = filter.initial_state((), chosen, generator)
+    for t, dt in enumerate((0.01, 0.03, 0.03, 0.02)):
+        state = filter.predict(state, dt, generator)
+        live.predict(dt)
+        state, _ = filter.update(state, y[0, t], observed[0, t], generator)
+        live.update(y[0, t], observed[0, t])
+    torch.testing.assert_close(live.state.members, state.members)
+
+
+def test_float32_on_a_long_run_stays_close() -> None:
+    """A thousand updates through the transform end where a thousand updates of everything do."""
+    y, observed = sequences(20)
+    ends = []
+    for sensors in (None, HUMAN):
+        live = LiveFilter(ebip(small_primitive(), 8), sensors, generator=torch.Generator().manual_seed(0))
+        for _ in range(50):
+            run(live, y[0].float(), observed[0])
+        ends.append(live.state.members)
+    torch.testing.assert_close(ends[0], ends[1], rtol=2e-2, atol=2e-3)
+
+
+def test_nothing_measured_changes_nothing() -> None:
+    live = LiveFilter(ebip(small_primitive(), weigh=True), HUMAN, generator=torch.Generator().manual_seed(0))
+    before = live.state
+    assert float(live.update(torch.full((5,), torch.nan))) == 0
+    assert torch.equal(live.state.members, before.members)
+
+
+def test_the_state_is_a_copy_and_leaves_the_demonstrations_alone() -> None:
+    filter = ebip(small_primitive())
+    demonstrations = filter.prior.states.clone()
+    live = LiveFilter(filter, HUMAN)
+    before = live.state.members
+    kept = before.clone()
+    live.update(torch.ones(5), HUMAN)
+    assert torch.equal(before, kept)
+    assert torch.equal(filter.prior.states, demonstrations)
+    assert not torch.equal(live.state.members, kept)
+
+
+@pytest.mark.parametrize(
+    ("y", "observed", "message"),
+    [
+        (torch.ones(4), None, r"y must be \[5\]"),
+        (torch.ones(5), None, r"DoFs \[3, 4\] are measured, but are none"),
+        (torch.tensor([1, torch.inf, 1, 1, 1]), HUMAN, r"infinite where it is observed, in DoFs \[1\]"),
+        (torch.ones(5), HUMAN.long(), "observed must be bool"),
+    ],
+)
+def test_what_is_refused_in_a_sample(y: Tensor, observed: Tensor | None, message: str) -> None:
+    live = LiveFilter(ebip(small_primitive()), HUMAN)
+    before = live.state.members
+    with pytest.raises(ValueError, match=message):
+        live.update(y, observed)
+    assert torch.equal(live.state.members, before)
+
+
+def test_what_is_refused_as_a_filter() -> None:
+    primitive = small_primitive()
+    with pytest.raises(ValueError, match="process noise"):
+        LiveFilter(ebip(primitive, weight_noise=0.1))
+    with pytest.raises(ValueError, match="localised"):
+        LiveFilter(ebip(primitive, localise=True))
+    with pytest.raises(ValueError, match=r"dofs must be bool \[5\]"):
+        LiveFilter(ebip(primitive), torch.zeros(5, dtype=torch.bool))
+    with pytest.raises(ValueError, match="at most one batch dimension"):
+        LiveFilter(ebip(primitive), batch_shape=(2, 3))
+    batch = LiveFilter(ebip(primitive), batch_shape=(2,))
+    observed = torch.stack([HUMAN, ~HUMAN])
+    with pytest.raises(ValueError, match="same DoFs in all its entries"):
+        batch.update(torch.ones(2, 5), observed)
+
+
+def test_a_covariance_that_cannot_be_factored_names_the_sensor() -> None:
+    filter: EnsembleFilter = ebip(small_primitive())
+    live = LiveFilter(filter, HUMAN)
+    live._members[2:] = torch.nan
+    with pytest.raises(ValueError, match=r"cannot be factored.*hand\.x"):
+        live.update(torch.ones(5), HUMAN)
+
+
+def test_span_members_are_what_they_were_started_with() -> None:
+    start = torch.randn(2, 3, 12, generator=torch.Generator().manual_seed(0))
+    for seen in (torch.arange(10), torch.tensor([1, 4, 5])):
+        span = SpanMembers(start, seen)
+        torch.testing.assert_close(span.members(torch.arange(10)), start)
+        assert span.matrix.shape == (2, 2 + min(10, len(seen) + 3), 3)

@@ -1,0 +1,289 @@
+"""The live path of an ensemble filter: in place and without gradients, for a robot's control loop.
+
+It gives the same numbers as `EnsembleFilter.predict` and `EnsembleFilter.update` for the same draws, faster:
+
+- what sensors do not see waits until a forecast asks for it (`SpanMembers`): a step does not pay for it;
+- members are columns, so that phases, projections and features lie contiguously, and products go into the members;
+- R is diagonal, and what depends on parameters alone is computed once;
+- buffers are kept from step to step, a set for each set of DoFs that are measured together.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from torch_ebip.draws import standard_normal
+from torch_ebip.filters.ensemble import EnsembleFilter, EnsembleState
+from torch_ebip.filters.evidence import Evidence
+from torch_ebip.filters.forecast import Forecast
+from torch_ebip.filters.interaction import BasisProjection, ConstantVelocityPhase
+from torch_ebip.filters.plan import Plan
+from torch_ebip.filters.span import SpanMembers
+from torch_ebip.functional.linear import FactorisationError, cholesky
+from torch_ebip.functional.moments import member_shares
+from torch_ebip.noise.process import InteractionNoise
+
+PLANS = 64
+"""For how many sets of measured DoFs buffers are kept; the set not used for longest is dropped."""
+
+
+class LiveFilter:
+    """An `EnsembleFilter` at work on one interaction, or on a batch of them that measure the same DoFs at a time.
+
+    Its state is its own and changes with `predict` and `update`; `state` gives a copy that the filter understands.
+    What depends on parameters is computed when it is first needed: after tuning, make a new one.
+
+    Args:
+        filter: made by `ebip` or `ebip_minus`.
+        dofs: bool [D], those that may be measured; default: all. The fewer, the faster.
+        batch_shape: leading dimensions, at most one.
+        members: int64 [..., E], which demonstrations form the ensemble; default: see the filter's prior.
+        generator: of all draws.
+
+    Raises:
+        ValueError: a filter whose updates are no transform of its members (process noise on weights,
+            localisation); no DoF that may be measured; more than one batch dimension.
+        TypeError: a filter that is not one of an interaction primitive.
+    """
+
+    @torch.no_grad()
+    def __init__(
+        self,
+        filter: EnsembleFilter,
+        dofs: Tensor | None = None,
+        batch_shape: tuple[int, ...] = (),
+        members: Tensor | None = None,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        reason = filter._leaves_span()
+        if reason is not None:
+            raise ValueError(f"a live filter transforms members as wholes, but {reason}; use the filter itself")
+        if len(batch_shape) > 1:
+            raise ValueError(f"a live filter has at most one batch dimension, got {list(batch_shape)}")
+        dofs = torch.ones(filter.n_dofs, dtype=torch.bool) if dofs is None else dofs.cpu()
+        if dofs.shape != (filter.n_dofs,) or dofs.dtype != torch.bool or not bool(dofs.any()):
+            raise ValueError(f"dofs must be bool [{filter.n_dofs}], some True, got {dofs.dtype} {tuple(dofs.shape)}")
+        part = filter.restrict(dofs)
+        assert isinstance(part.observation, BasisProjection)
+        assert isinstance(part.dynamics, ConstantVelocityPhase)
+        assert isinstance(part.noise.process, InteractionNoise)
+        self.filter, self.generator, self.batch_shape = filter, generator, batch_shape
+        self._part, self._hold, self._process = part, part.dynamics.hold, part.noise.process
+        self._basis = part.observation.basis
+        self._sensors = {dof: row for row, dof in enumerate(dofs.nonzero().squeeze(-1).tolist())}
+        self._start = start = filter.prior(batch_shape, filter.n_members, members, generator)
+        columns = self._columns(dofs)
+        self._span = SpanMembers(start, columns)
+        self._members = self._span.matrix
+        self._phase, self._velocity = self._members[..., 0, :], self._members[..., 1, :]
+        self._moving = self._members[..., :2, :]
+        self._draws_here = generator is None or generator.device == start.device
+        self._draws = start.new_empty(*start.shape[:-1], 2)
+        self._draws_by_entry = self._draws.transpose(-1, -2)
+        self._evidence = None if part.weighting is None else part.weighting.start(self._span.members(columns))
+        E = start.shape[-2]
+        self._equal = start.new_full((*batch_shape, E, 1), 1 / E)
+        self._growth = 1.0
+        if filter.inflation is not None:
+            self._growth = float(filter._inflation_factor(start)) ** filter.thinning
+        self._changing_noise = getattr(filter.noise.measurement, "context", None) is not None
+        self._factor: tuple[float, Tensor] | None = None
+        self._terms = start.new_empty(math.prod(batch_shape) * len(columns) * E)
+        self._plan = lru_cache(maxsize=PLANS)(self._make_plan)
+        self._add_product: Callable[..., Tensor] = Tensor.baddbmm_ if batch_shape else Tensor.addmm_
+        self._plus_product: Callable[..., Tensor] = torch.baddbmm if batch_shape else torch.addmm
+        self._forecaster = lru_cache(maxsize=PLANS)(self._make_forecaster)
+
+    @property
+    def state(self) -> EnsembleState:
+        """A copy of everything, for `filter`."""
+        return self._state(torch.arange(self._start.shape[-1] - 2, device=self._start.device))
+
+    @property
+    def phase(self) -> Tensor:
+        """Mean phase [...]."""
+        even = self._equal if self._evidence is None else self._evidence.weights.unsqueeze(-1)
+        return (self._phase.unsqueeze(-2) @ even).squeeze((-1, -2))
+
+    @torch.no_grad()
+    def forecast(self, phase: Tensor | None = None, dofs: Tensor | None = None) -> Forecast:
+        """See `Filter.forecast`; of the DoFs bool [D] only, if given, which costs less than all."""
+        if dofs is not None and (dofs.shape != (self.filter.n_dofs,) or dofs.dtype != torch.bool):
+            raise ValueError(f"dofs must be bool [{self.filter.n_dofs}], got {dofs.dtype} {list(dofs.shape)}")
+        chosen = (True,) * self.filter.n_dofs if dofs is None else tuple(dofs.tolist())
+        part, columns = self._forecaster(chosen)
+        return part.forecast(self._state(columns), phase)
+
+    @torch.no_grad()
+    def predict(self, dt: float | None = None) -> None:
+        """Propagate by dt seconds; default: the time between samples of the demonstrations."""
+        dt = self.filter.dt if dt is None else float(dt)
+        if self._factor is None or self._factor[0] != dt:
+            factor = self._process.phase_factor(self._phase.new_tensor(dt))
+            self._factor = dt, factor.expand(*self.batch_shape, 2, 2)
+        phase = self._phase.add_(self._velocity, alpha=dt)
+        low, high = torch.aminmax(phase)
+        if float(low) < 0 or float(high) > 1:
+            phase.copy_(self._hold(phase))
+        self._drawn(self._draws)
+        self._add_product(self._moving, self._factor[1], self._draws_by_entry)
+        if self._evidence is not None and self._part.weighting is not None:
+            self._evidence = self._part.weighting.forget(self._evidence, self._phase.new_tensor(dt))
+
+    @torch.no_grad()
+    def update(self, y: Tensor, observed: Tensor | None = None) -> Tensor:
+        """Take in one sample.
+
+        Args:
+            y: [..., D] in units of the DoFs.
+            observed: bool [..., D]; default: where y is not NaN.
+
+        Returns:
+            Log-likelihood [...] of the sample; 0 where nothing was measured, which changes nothing.
+
+        Raises:
+            ValueError: wrong shapes; infinity, or NaN where observed; a DoF that is none of the sensors'; entries
+                of the batch that measure different DoFs; an innovation covariance that cannot be factored.
+        """
+        plan = self._plan(self._measured(y, observed))
+        if plan is None:
+            return y.new_zeros(self.batch_shape)
+        values = torch.index_select(y, -1, plan.dofs, out=plan.values).unsqueeze(-1)
+        E = self._members.shape[-1]
+        weights = None if self._evidence is None else self._evidence.weights.unsqueeze(-1)
+        even = self._equal if weights is None else weights
+        projections = plan.project(self._phase)
+        mean = projections @ even
+        anomalies = torch.sub(projections, mean, out=plan.anomalies)
+        deviation, R = self._measurement_noise(plan)
+        weighted, share = plan.anomalies_by_member, 1 / (E - 1)
+        if weights is not None:
+            weighted, share = weighted * member_shares(weighted, weights.squeeze(-1)), 1.0
+        S = self._plus_product(R, anomalies, weighted, alpha=share)
+        factor, info = torch.linalg.cholesky_ex(S)
+        if bool(info.any() if self.batch_shape else info):
+            self._explain(S, plan)
+        residual = torch.sub(values, mean, out=plan.right_mean)
+        if self.filter.square_root:
+            shift = torch.cholesky_solve(residual, factor)
+            half = torch.linalg.solve_triangular(factor + torch.diag_embed(deviation[..., 0]), anomalies, upper=False)
+            moves = shift - torch.linalg.solve_triangular(factor.transpose(-1, -2), half, upper=True)
+        else:
+            self._drawn(plan.draws)
+            torch.addcmul(values, deviation, plan.draws_by_dof, out=plan.right_members).sub_(projections)
+            torch.cholesky_solve(plan.right, factor, out=plan.solved)
+            moves, shift = plan.moves, plan.shift
+        likelihood = self._likelihood(plan, factor, residual, shift)
+        if self._evidence is not None:
+            self._learn(self._evidence, plan, values[..., 0])
+        self._move(weighted, moves, share, even)
+        return likelihood
+
+    def _likelihood(self, plan: Plan, factor: Tensor, residual: Tensor, shift: Tensor) -> Tensor:
+        """Log-likelihood [...] of a residual r [..., K, 1] with shift S^-1 r; ValueError if it is not finite."""
+        diagonal = factor.diagonal(dim1=-2, dim2=-1)
+        if self.batch_shape:
+            distance = (residual * shift).sum((-1, -2))
+            finite = bool(distance.isfinite().all())
+            likelihood = torch.sub(plan.constant, torch.add(diagonal.log().sum(-1), distance, alpha=0.5))
+        else:  # a few numbers: faster in Python than in kernels
+            deviance = float(torch.dot(residual.view(-1), shift.view(-1)))
+            finite = math.isfinite(deviance)
+            deviance = sum(map(math.log, diagonal.tolist())) + 0.5 * deviance if finite else math.nan
+            likelihood = torch.sub(plan.constant, plan.one, alpha=deviance)
+        if not finite:
+            bad = plan.dofs[(~plan.values.isfinite()).reshape(-1, len(plan.dofs)).any(0)].tolist()
+            raise ValueError(f"y is NaN or infinite where it is observed, in DoFs {bad[:8]}; mark it False there")
+        return likelihood
+
+    def _drawn(self, buffer: Tensor) -> Tensor:
+        """The buffer, filled with standard-normal draws: those that `standard_normal` would make."""
+        if self._draws_here:
+            return buffer.normal_(generator=self.generator)
+        return buffer.copy_(standard_normal(buffer.shape, buffer, self.generator))
+
+    def _move(self, weighted: Tensor, moves: Tensor, share: float, even: Tensor) -> None:
+        """X <- X + share (X weighted) moves in place, then inflated about its mean, the product with ``even``."""
+        members, growth = self._members, self._growth
+        cross = members @ weighted
+        if growth == 1:
+            self._add_product(members, cross, moves, alpha=share)
+            return
+        mean = self._plus_product(members @ even, cross, moves @ even, alpha=share)
+        self._add_product(members, cross, moves, beta=growth, alpha=share * growth)
+        members.add_(mean, alpha=1 - growth)
+
+    def _measured(self, y: Tensor, observed: Tensor | None) -> tuple[bool, ...]:
+        """Whether each DoF was measured."""
+        shape = (*self.batch_shape, self.filter.n_dofs)
+        if y.shape != shape:
+            raise ValueError(f"y must be {list(shape)}, one value for each DoF, got {list(y.shape)}")
+        if observed is None:
+            observed = y == y  # not where it is NaN
+        elif observed.dtype != torch.bool or observed.shape != shape:
+            raise ValueError(f"observed must be bool {list(shape)}, got {observed.dtype} {list(observed.shape)}")
+        if self.batch_shape:
+            every = observed
+            observed = every[0]
+            if bool((every != observed).any()):
+                raise ValueError("a live batch measures the same DoFs in all its entries; use the filter itself")
+        return tuple(observed.tolist())
+
+    def _make_plan(self, measured: tuple[bool, ...]) -> Plan | None:
+        """Buffers for the DoFs that are measured together; None for none."""
+        dofs = [dof for dof, here in enumerate(measured) if here]
+        strangers = [dof for dof in dofs if dof not in self._sensors]
+        if strangers:
+            raise ValueError(
+                f"DoFs {strangers[:8]} are measured, but are none of those this live filter was made for"
+            )
+        if not dofs:
+            return None
+        return Plan(self._basis, self._span, dofs, [self._sensors[dof] for dof in dofs], self._terms)
+
+    def _measurement_noise(self, plan: Plan) -> tuple[Tensor, Tensor]:
+        """Deviations as a column, [..., K, 1], and R, [..., K, K]; found once where they do not depend on phase."""
+        if plan.noise is not None:
+            return plan.noise
+        changing = self._changing_noise
+        deviation = self._part._deviation(self.phase if changing else None)[..., plan.rows]
+        R = torch.diag_embed(deviation.square())
+        noise = deviation.unsqueeze(-1), R.expand(*self.batch_shape, *R.shape[-2:])
+        plan.noise = None if changing else noise
+        return noise
+
+    def _learn(self, evidence: Evidence, plan: Plan, values: Tensor) -> None:
+        weighting = self._part.weighting
+        assert weighting is not None
+        phases = (self._phase.unsqueeze(-1) + weighting.offsets).clamp(0, 1)
+        paths = self._basis.project_paths(phases, evidence.origin, plan.rows.tolist())
+        columns = plan.rows if self._part.columns is None else self._part.columns[plan.rows]
+        seen = torch.ones_like(values, dtype=torch.bool)
+        self._evidence = weighting.learn(evidence, paths, values, seen, self.phase, columns)
+
+    def _explain(self, S: Tensor, plan: Plan) -> None:
+        try:
+            cholesky(S, plan.dofs)
+        except FactorisationError as error:
+            raise self.filter._named(error, None) from error
+
+    def _columns(self, dofs: Tensor) -> Tensor:
+        """int64: which weights are those of some DoFs, bool [D]."""
+        observation = self.filter.observation
+        assert isinstance(observation, BasisProjection)
+        return dofs[observation.basis.dof_of_weight()].nonzero().squeeze(-1).to(self._start.device)
+
+    def _make_forecaster(self, chosen: tuple[bool, ...]) -> tuple[EnsembleFilter, Tensor]:
+        dofs = torch.tensor(chosen)
+        return (self.filter if all(chosen) else self.filter.restrict(dofs)), self._columns(dofs)
+
+    def _state(self, columns: Tensor) -> EnsembleState:
+        evidence = self._evidence
+        if evidence is not None:
+            evidence = evidence._replace(origin=self._start[..., 2 + columns])
+        return EnsembleState(self._span.members(columns), evidence)
