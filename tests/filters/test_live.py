@@ -73,6 +73,41 @@ def test_the_numbers_of_the_filter(
         torch.testing.assert_close(forecast.phase, expected.phase)
 
 
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
+@pytest.mark.parametrize("project", [False, True])
+@pytest.mark.parametrize("members", [None, 4])
+def test_a_sequence_without_gradients(options: dict[str, Any], project: bool, members: int | None) -> None:
+    """Entries of the batch with gaps of their own; restricted and thinned, as tuning uses it."""
+    filter = ebip(small_primitive(torch.float64), members, **options)
+    y, _ = sequences()
+    observed = torch.rand(y.shape, generator=torch.Generator().manual_seed(5)) < 0.7
+    observed[..., 3:] = False
+    observed[1, 6:9] = False
+    observed[:, 20] = False
+    y[~observed] = torch.nan
+    keep = torch.tensor([[3, 9], [0, 29], [9, 9]])
+    for made, columns in (
+        (filter, slice(None)),
+        (filter.restrict(torch.tensor([1, 1, 0, 1, 0]).bool(), 2), [0, 1, 3]),
+    ):
+        arguments = (y[..., columns], observed[..., columns])
+        options_ = {"keep": keep, "project": project}
+        with_gradients = made(*arguments, generator=torch.Generator().manual_seed(1), **options_)
+        with torch.no_grad():
+            without = made(*arguments, generator=torch.Generator().manual_seed(1), **options_)
+        assert with_gradients.log_likelihood.requires_grad
+        assert not without.log_likelihood.requires_grad
+        for mine, theirs in zip(_leaves(without), _leaves(with_gradients), strict=True):
+            torch.testing.assert_close(mine, theirs)
+
+
+def _leaves(trace: Any) -> list[Tensor]:
+    """The tensors in a trace."""
+    if trace is None or isinstance(trace, Tensor):
+        return [] if trace is None else [trace]
+    return [leaf for part in trace for leaf in _leaves(part)]
+
+
 def test_bases_that_differ_between_modalities() -> None:
     bases = [BSplineBasis(6), BSplineBasis(6), GaussianBasis(7), GaussianBasis(5), BSplineBasis(6)]
     primitive = InteractionPrimitive.fit(interactions(24, dtype=torch.float64), StackedBasis(bases))
@@ -156,10 +191,6 @@ def test_what_is_refused_as_a_filter() -> None:
         LiveFilter(ebip(primitive), torch.zeros(5, dtype=torch.bool))
     with pytest.raises(ValueError, match="at most one batch dimension"):
         LiveFilter(ebip(primitive), batch_shape=(2, 3))
-    batch = LiveFilter(ebip(primitive), batch_shape=(2,))
-    observed = torch.stack([HUMAN, ~HUMAN])
-    with pytest.raises(ValueError, match="same DoFs in all its entries"):
-        batch.update(torch.ones(2, 5), observed)
 
 
 def test_a_covariance_that_cannot_be_factored_names_the_sensor() -> None:

@@ -2,47 +2,21 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor, nn
 
 from torch_ebip import functional
 from torch_ebip.draws import standard_normal
+from torch_ebip.filters.base import Trace
 from torch_ebip.filters.evidence import Evidence, EvidenceWeighting
+from torch_ebip.filters.in_place import filter_in_place
 from torch_ebip.filters.interaction import BasisProjection
 from torch_ebip.filters.localisation import Localisation
-from torch_ebip.filters.members import MemberFilter
+from torch_ebip.filters.members import EnsembleState, MemberFilter
 from torch_ebip.filters.priors import select_prior
 from torch_ebip.functional import Taper
 from torch_ebip.noise.pair import FilterNoise
-
-
-class EnsembleState(NamedTuple):
-    """An ensemble.
-
-    Attributes:
-        members: [..., E, n].
-        evidence: what weights of the members rest on; None where all count alike.
-    """
-
-    members: Tensor
-    evidence: Evidence | None = None
-
-    @property
-    def weights(self) -> Tensor | None:
-        """[..., E], summing to 1; None where all members count alike."""
-        return None if self.evidence is None else self.evidence.weights
-
-    @property
-    def mean(self) -> Tensor:
-        """[..., n]."""
-        return functional.ensemble_mean(self.members, self.weights)
-
-    @property
-    def covariance(self) -> Tensor:
-        """[..., n, n], A'A / (E - 1), or its weighted form."""
-        return functional.ensemble_covariance(self.members, self.weights)
+from torch_ebip.noise.process import InteractionNoise
 
 
 class EnsembleFilter(MemberFilter):
@@ -197,6 +171,30 @@ class EnsembleFilter(MemberFilter):
             model.dof_names,
         )
         return part.train(self.training)
+
+    def _without_gradients(
+        self,
+        y: Tensor,
+        observed: Tensor,
+        dt: float | Tensor,
+        state: EnsembleState,
+        generator: torch.Generator | None,
+        keep: Tensor | None,
+        project: bool,
+    ) -> Trace | None:
+        """See `Filter._without_gradients`: in place, where updates are transforms of the members."""
+        one_interaction = isinstance(self.observation, BasisProjection) and isinstance(
+            self.noise.process, InteractionNoise
+        )
+        if (
+            not one_interaction
+            or self._leaves_span() is not None
+            or isinstance(dt, Tensor)
+            or y.ndim > 3
+            or state.members.shape[:-2] != y.shape[:-2]
+        ):
+            return None
+        return filter_in_place(self, y, observed, dt, state, generator, keep, project)
 
     def _leaves_span(self) -> str | None:
         return "covariances are localised" if self.localisation is not None else super()._leaves_span()

@@ -1,4 +1,4 @@
-"""The live path of an ensemble filter: in place and without gradients, for a robot's control loop.
+"""The live path of an ensemble filter: in place and without gradients, for a robot's control loop and for studies.
 
 It gives the same numbers as `EnsembleFilter.predict` and `EnsembleFilter.update` for the same draws, faster:
 
@@ -13,27 +13,31 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from torch_ebip.draws import standard_normal
-from torch_ebip.filters.ensemble import EnsembleFilter, EnsembleState
 from torch_ebip.filters.evidence import Evidence
 from torch_ebip.filters.forecast import Forecast
 from torch_ebip.filters.interaction import BasisProjection, ConstantVelocityPhase
+from torch_ebip.filters.members import EnsembleState
 from torch_ebip.filters.plan import Plan
 from torch_ebip.filters.span import SpanMembers
 from torch_ebip.functional.linear import FactorisationError, cholesky
 from torch_ebip.functional.moments import member_shares
 from torch_ebip.noise.process import InteractionNoise
 
+if TYPE_CHECKING:
+    from torch_ebip.filters.ensemble import EnsembleFilter
+
 PLANS = 64
 """For how many sets of measured DoFs buffers are kept; the set not used for longest is dropped."""
 
 
 class LiveFilter:
-    """An `EnsembleFilter` at work on one interaction, or on a batch of them that measure the same DoFs at a time.
+    """An `EnsembleFilter` at work on one interaction, or on a batch of them in step.
 
     Its state is its own and changes with `predict` and `update`; `state` gives a copy that the filter understands.
     What depends on parameters is computed when it is first needed: after tuning, make a new one.
@@ -44,6 +48,7 @@ class LiveFilter:
         batch_shape: leading dimensions, at most one.
         members: int64 [..., E], which demonstrations form the ensemble; default: see the filter's prior.
         generator: of all draws.
+        state: where to start, batch dimensions ``batch_shape``; default: the filter's initial state.
 
     Raises:
         ValueError: a filter whose updates are no transform of its members (process noise on weights,
@@ -59,6 +64,7 @@ class LiveFilter:
         batch_shape: tuple[int, ...] = (),
         members: Tensor | None = None,
         generator: torch.Generator | None = None,
+        state: EnsembleState | None = None,
     ) -> None:
         reason = filter._leaves_span()
         if reason is not None:
@@ -76,8 +82,13 @@ class LiveFilter:
         self._part, self._hold, self._process = part, part.dynamics.hold, part.noise.process
         self._basis = part.observation.basis
         self._sensors = {dof: row for row, dof in enumerate(dofs.nonzero().squeeze(-1).tolist())}
-        self._start = start = filter.prior(batch_shape, filter.n_members, members, generator)
+        state = filter.initial_state(batch_shape, members, generator) if state is None else state
+        self._start = start = state.members
+        self._evidence = state.evidence
+        self._origin = None if state.evidence is None else state.evidence.origin
         columns = self._columns(dofs)
+        if state.evidence is not None:
+            self._evidence = state.evidence._replace(origin=state.evidence.origin[..., columns])
         self._span = SpanMembers(start, columns)
         self._members = self._span.matrix
         self._phase, self._velocity = self._members[..., 0, :], self._members[..., 1, :]
@@ -85,13 +96,12 @@ class LiveFilter:
         self._draws_here = generator is None or generator.device == start.device
         self._draws = start.new_empty(*start.shape[:-1], 2)
         self._draws_by_entry = self._draws.transpose(-1, -2)
-        self._evidence = None if part.weighting is None else part.weighting.start(self._span.members(columns))
         E = start.shape[-2]
         self._equal = start.new_full((*batch_shape, E, 1), 1 / E)
         self._growth = 1.0
         if filter.inflation is not None:
             self._growth = float(filter._inflation_factor(start)) ** filter.thinning
-        self._changing_noise = getattr(filter.noise.measurement, "context", None) is not None
+        self._changing_noise = bool(getattr(filter.noise.measurement, "depends_on_phase", True))
         self._factor: tuple[float, Tensor] | None = None
         self._terms = start.new_empty(math.prod(batch_shape) * len(columns) * E)
         self._plan = lru_cache(maxsize=PLANS)(self._make_plan)
@@ -102,7 +112,11 @@ class LiveFilter:
     @property
     def state(self) -> EnsembleState:
         """A copy of everything, for `filter`."""
-        return self._state(torch.arange(self._start.shape[-1] - 2, device=self._start.device))
+        return self.entry(None)
+
+    def entry(self, index: int | None) -> EnsembleState:
+        """The state of one entry of the batch, without that dimension; of all for None."""
+        return self._state(torch.arange(self._start.shape[-1] - 2, device=self._start.device), index)
 
     @property
     def phase(self) -> Tensor:
@@ -118,6 +132,14 @@ class LiveFilter:
         chosen = (True,) * self.filter.n_dofs if dofs is None else tuple(dofs.tolist())
         part, columns = self._forecaster(chosen)
         return part.forecast(self._state(columns), phase)
+
+    @torch.no_grad()
+    def project(self, dofs: tuple[bool, ...]) -> Tensor:
+        """[..., D_chosen], mean of h(x) of some of the sensors' DoFs, a bool for each DoF of the filter."""
+        plan = self._plan(dofs)
+        assert plan is not None
+        even = self._equal if self._evidence is None else self._evidence.weights.unsqueeze(-1)
+        return (plan.project(self._phase) @ even).squeeze(-1)
 
     @torch.no_grad()
     def predict(self, dt: float | None = None) -> None:
@@ -147,10 +169,20 @@ class LiveFilter:
             Log-likelihood [...] of the sample; 0 where nothing was measured, which changes nothing.
 
         Raises:
-            ValueError: wrong shapes; infinity, or NaN where observed; a DoF that is none of the sensors'; entries
-                of the batch that measure different DoFs; an innovation covariance that cannot be factored.
+            ValueError: wrong shapes; infinity, or NaN where observed; a DoF that is none of the sensors'; an
+                innovation covariance that cannot be factored.
         """
-        plan = self._plan(self._measured(y, observed))
+        return self.take(y, *self._measured(y, observed))
+
+    def take(self, y: Tensor, measured: tuple[bool, ...], mask: Tensor | None) -> Tensor:
+        """`update` with arguments that were checked.
+
+        Args:
+            y: [..., D].
+            measured: D, which DoFs some entry of the batch measured.
+            mask: bool [B, D], which of them each entry did; None if all did.
+        """
+        plan = self._plan(measured)
         if plan is None:
             return y.new_zeros(self.batch_shape)
         values = torch.index_select(y, -1, plan.dofs, out=plan.values).unsqueeze(-1)
@@ -160,7 +192,12 @@ class LiveFilter:
         projections = plan.project(self._phase)
         mean = projections @ even
         anomalies = torch.sub(projections, mean, out=plan.anomalies)
-        deviation, R = self._measurement_noise(plan)
+        deviation, R = plan.measurement_noise(self._deviations)
+        seen = None
+        if mask is not None:
+            seen = mask.index_select(-1, plan.dofs).unsqueeze(-1)
+            deviation, R = plan.without(seen, deviation, R)
+            anomalies.masked_fill_(~seen, 0)
         weighted, share = plan.anomalies_by_member, 1 / (E - 1)
         if weights is not None:
             weighted, share = weighted * member_shares(weighted, weights.squeeze(-1)), 1.0
@@ -169,36 +206,23 @@ class LiveFilter:
         if bool(info.any() if self.batch_shape else info):
             self._explain(S, plan)
         residual = torch.sub(values, mean, out=plan.right_mean)
+        if seen is not None:
+            residual.masked_fill_(~seen, 0)
         if self.filter.square_root:
             shift = torch.cholesky_solve(residual, factor)
             half = torch.linalg.solve_triangular(factor + torch.diag_embed(deviation[..., 0]), anomalies, upper=False)
             moves = shift - torch.linalg.solve_triangular(factor.transpose(-1, -2), half, upper=True)
         else:
             self._drawn(plan.draws)
-            torch.addcmul(values, deviation, plan.draws_by_dof, out=plan.right_members).sub_(projections)
+            # y + eps - HX, as (y - mean) + eps - HA: what is not measured is 0 in all of them.
+            torch.addcmul(residual, deviation, plan.draws_by_dof, out=plan.right_members).sub_(anomalies)
             torch.cholesky_solve(plan.right, factor, out=plan.solved)
             moves, shift = plan.moves, plan.shift
-        likelihood = self._likelihood(plan, factor, residual, shift)
+        likelihood = plan.log_likelihood(factor, residual, shift, seen)
         if self._evidence is not None:
-            self._learn(self._evidence, plan, values[..., 0])
-        self._move(weighted, moves, share, even)
-        return likelihood
-
-    def _likelihood(self, plan: Plan, factor: Tensor, residual: Tensor, shift: Tensor) -> Tensor:
-        """Log-likelihood [...] of a residual r [..., K, 1] with shift S^-1 r; ValueError if it is not finite."""
-        diagonal = factor.diagonal(dim1=-2, dim2=-1)
-        if self.batch_shape:
-            distance = (residual * shift).sum((-1, -2))
-            finite = bool(distance.isfinite().all())
-            likelihood = torch.sub(plan.constant, torch.add(diagonal.log().sum(-1), distance, alpha=0.5))
-        else:  # a few numbers: faster in Python than in kernels
-            deviance = float(torch.dot(residual.view(-1), shift.view(-1)))
-            finite = math.isfinite(deviance)
-            deviance = sum(map(math.log, diagonal.tolist())) + 0.5 * deviance if finite else math.nan
-            likelihood = torch.sub(plan.constant, plan.one, alpha=deviance)
-        if not finite:
-            bad = plan.dofs[(~plan.values.isfinite()).reshape(-1, len(plan.dofs)).any(0)].tolist()
-            raise ValueError(f"y is NaN or infinite where it is observed, in DoFs {bad[:8]}; mark it False there")
+            here = torch.ones_like(values, dtype=torch.bool) if seen is None else seen
+            self._learn(self._evidence, plan, values[..., 0], here[..., 0])
+        self._move(weighted, moves, share, even, seen)
         return likelihood
 
     def _drawn(self, buffer: Tensor) -> Tensor:
@@ -207,19 +231,19 @@ class LiveFilter:
             return buffer.normal_(generator=self.generator)
         return buffer.copy_(standard_normal(buffer.shape, buffer, self.generator))
 
-    def _move(self, weighted: Tensor, moves: Tensor, share: float, even: Tensor) -> None:
+    def _move(self, weighted: Tensor, moves: Tensor, share: float, even: Tensor, seen: Tensor | None) -> None:
         """X <- X + share (X weighted) moves in place, then inflated about its mean, the product with ``even``."""
-        members, growth = self._members, self._growth
-        cross = members @ weighted
-        if growth == 1:
-            self._add_product(members, cross, moves, alpha=share)
+        self._add_product(self._members, self._members @ weighted, moves, alpha=share)
+        if self._growth == 1:
             return
-        mean = self._plus_product(members @ even, cross, moves @ even, alpha=share)
-        self._add_product(members, cross, moves, beta=growth, alpha=share * growth)
-        members.add_(mean, alpha=1 - growth)
+        mean = self._members @ even
+        if seen is None:
+            self._members.lerp_(mean, 1 - self._growth)
+        else:
+            self._members.lerp_(mean, (1 - self._growth) * seen.any(-2, keepdim=True).to(mean))
 
-    def _measured(self, y: Tensor, observed: Tensor | None) -> tuple[bool, ...]:
-        """Whether each DoF was measured."""
+    def _measured(self, y: Tensor, observed: Tensor | None) -> tuple[tuple[bool, ...], Tensor | None]:
+        """Which DoFs were measured by some entry of the batch, and by which if not by all."""
         shape = (*self.batch_shape, self.filter.n_dofs)
         if y.shape != shape:
             raise ValueError(f"y must be {list(shape)}, one value for each DoF, got {list(y.shape)}")
@@ -227,12 +251,16 @@ class LiveFilter:
             observed = y == y  # not where it is NaN
         elif observed.dtype != torch.bool or observed.shape != shape:
             raise ValueError(f"observed must be bool {list(shape)}, got {observed.dtype} {list(observed.shape)}")
-        if self.batch_shape:
-            every = observed
-            observed = every[0]
-            if bool((every != observed).any()):
-                raise ValueError("a live batch measures the same DoFs in all its entries; use the filter itself")
-        return tuple(observed.tolist())
+        if not self.batch_shape:
+            return tuple(observed.tolist()), None
+        some = observed.any(0)
+        mask = None if bool((observed == some).all()) else observed
+        return tuple(some.tolist()), mask
+
+    def _deviations(self) -> tuple[Tensor, bool]:
+        """Standard deviations of all sensors' DoFs now, and whether they change with phase."""
+        changing = self._changing_noise
+        return self._part._deviation(self.phase if changing else None), changing
 
     def _make_plan(self, measured: tuple[bool, ...]) -> Plan | None:
         """Buffers for the DoFs that are measured together; None for none."""
@@ -246,24 +274,12 @@ class LiveFilter:
             return None
         return Plan(self._basis, self._span, dofs, [self._sensors[dof] for dof in dofs], self._terms)
 
-    def _measurement_noise(self, plan: Plan) -> tuple[Tensor, Tensor]:
-        """Deviations as a column, [..., K, 1], and R, [..., K, K]; found once where they do not depend on phase."""
-        if plan.noise is not None:
-            return plan.noise
-        changing = self._changing_noise
-        deviation = self._part._deviation(self.phase if changing else None)[..., plan.rows]
-        R = torch.diag_embed(deviation.square())
-        noise = deviation.unsqueeze(-1), R.expand(*self.batch_shape, *R.shape[-2:])
-        plan.noise = None if changing else noise
-        return noise
-
-    def _learn(self, evidence: Evidence, plan: Plan, values: Tensor) -> None:
+    def _learn(self, evidence: Evidence, plan: Plan, values: Tensor, seen: Tensor) -> None:
         weighting = self._part.weighting
         assert weighting is not None
         phases = (self._phase.unsqueeze(-1) + weighting.offsets).clamp(0, 1)
         paths = self._basis.project_paths(phases, evidence.origin, plan.rows.tolist())
         columns = plan.rows if self._part.columns is None else self._part.columns[plan.rows]
-        seen = torch.ones_like(values, dtype=torch.bool)
         self._evidence = weighting.learn(evidence, paths, values, seen, self.phase, columns)
 
     def _explain(self, S: Tensor, plan: Plan) -> None:
@@ -282,8 +298,10 @@ class LiveFilter:
         dofs = torch.tensor(chosen)
         return (self.filter if all(chosen) else self.filter.restrict(dofs)), self._columns(dofs)
 
-    def _state(self, columns: Tensor) -> EnsembleState:
+    def _state(self, columns: Tensor, entry: int | None = None) -> EnsembleState:
         evidence = self._evidence
-        if evidence is not None:
-            evidence = evidence._replace(origin=self._start[..., 2 + columns])
-        return EnsembleState(self._span.members(columns), evidence)
+        if evidence is not None and self._origin is not None:
+            evidence = evidence._replace(origin=self._origin[..., columns])
+            if entry is not None:
+                evidence = Evidence(*(part[entry] for part in evidence))
+        return EnsembleState(self._span.members(columns, entry), evidence)

@@ -3,16 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from torch_ebip import functional
 from torch_ebip.filters.base import Filter
+from torch_ebip.filters.evidence import Evidence
 from torch_ebip.filters.forecast import Forecast
 from torch_ebip.filters.interaction import BasisProjection
 from torch_ebip.filters.sequence import State
 from torch_ebip.noise.pair import FilterNoise
+
+
+class EnsembleState(NamedTuple):
+    """An ensemble.
+
+    Attributes:
+        members: [..., E, n].
+        evidence: what weights of the members rest on; None where all count alike.
+    """
+
+    members: Tensor
+    evidence: Evidence | None = None
+
+    @property
+    def weights(self) -> Tensor | None:
+        """[..., E], summing to 1; None where all members count alike."""
+        return None if self.evidence is None else self.evidence.weights
+
+    @property
+    def mean(self) -> Tensor:
+        """[..., n]."""
+        return functional.ensemble_mean(self.members, self.weights)
+
+    @property
+    def covariance(self) -> Tensor:
+        """[..., n, n], A'A / (E - 1), or its weighted form."""
+        return functional.ensemble_covariance(self.members, self.weights)
 
 
 class MemberFilter(Filter):

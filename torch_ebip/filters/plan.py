@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -41,7 +41,6 @@ class Plan:
         draws: buffer [..., E, K]; ``draws_by_dof`` the other way round.
         constant: of the log-likelihood, -K / 2 log(2 pi).
         values: buffer [..., K], of what was measured.
-        noise: deviations [..., K, 1] and R [..., K, K], once they are known for good.
     """
 
     def __init__(
@@ -61,7 +60,7 @@ class Plan:
         self.moves, self.shift = self.solved[..., :E], self.solved[..., E:]
         self.one = like.new_ones(())
         self.constant = like.new_tensor(-0.5 * K * math.log(2 * math.pi))
-        self.noise: tuple[Tensor, Tensor] | None = None
+        self._noise: tuple[Tensor, Tensor] | None = None
         self._ranges = []
         self._families = families = basis.families
         for first, last in _neighbours(basis, rows):
@@ -85,6 +84,56 @@ class Plan:
             torch.mul(weights, features[family], out=terms)
             torch.sum(terms, -2, out=projections)
         return self.projections
+
+    def measurement_noise(self, deviations: Callable[[], tuple[Tensor, bool]]) -> tuple[Tensor, Tensor]:
+        """Deviations as a column, [..., K, 1], and R, [..., K, K]; asked for once if they do not change with phase.
+
+        Args:
+            deviations: gives those of all sensors' DoFs, [..., D], and whether they change.
+        """
+        if self._noise is not None:
+            return self._noise
+        every, changing = deviations()
+        deviation = every[..., self.rows]
+        R = torch.diag_embed(deviation.square())
+        noise = deviation.unsqueeze(-1), R.expand(*self.values.shape[:-1], *R.shape[-2:])
+        self._noise = None if changing else noise
+        return noise
+
+    def log_likelihood(self, factor: Tensor, residual: Tensor, shift: Tensor, seen: Tensor | None) -> Tensor:
+        """Log-likelihood [...] of a sample.
+
+        Args:
+            factor: Cholesky factor of S, [..., K, K].
+            residual: y - mean HX, [..., K, 1].
+            shift: S^-1 times it.
+            seen: bool [B, K, 1], what each entry of the batch measured; None for all.
+
+        Raises:
+            ValueError: a value that was measured is NaN or infinite.
+        """
+        diagonal = factor.diagonal(dim1=-2, dim2=-1)
+        if self.values.ndim > 1:
+            distance = (residual * shift).sum((-1, -2))
+            finite = bool(distance.isfinite().all())
+            constant = self.constant if seen is None else self.constant * seen.to(residual).mean((-1, -2))
+            likelihood = torch.sub(constant, torch.add(diagonal.log().sum(-1), distance, alpha=0.5))
+        else:  # a few numbers: faster in Python than in kernels
+            deviance = float(torch.dot(residual.view(-1), shift.view(-1)))
+            finite = math.isfinite(deviance)
+            deviance = sum(map(math.log, diagonal.tolist())) + 0.5 * deviance if finite else math.nan
+            likelihood = torch.sub(self.constant, self.one, alpha=deviance)
+        if not finite:
+            infinite = ~self.values.isfinite() if seen is None else ~self.values.isfinite() & seen[..., 0]
+            bad = self.dofs[infinite.reshape(-1, len(self.dofs)).any(0)].tolist()
+            raise ValueError(f"y is NaN or infinite where it is observed, in DoFs {bad[:8]}; mark it False there")
+        return likelihood
+
+    @staticmethod
+    def without(seen: Tensor, deviation: Tensor, R: Tensor) -> tuple[Tensor, Tensor]:
+        """Deviations and R where rows that are not seen, bool [B, K, 1], have no noise and 1 on R's diagonal."""
+        one = torch.eye(R.shape[-1], dtype=R.dtype, device=R.device)
+        return torch.where(seen, deviation, 0), torch.where(seen, R, one)
 
 
 def _neighbours(basis: StackedBasis, rows: Sequence[int]) -> list[tuple[int, int]]:

@@ -41,18 +41,22 @@ class SpanMembers:
         """A slice of the weights that sensors see, [..., m, E]: a view."""
         return self.matrix[..., 2 + part.start : 2 + part.stop, :]
 
-    def weights(self, columns: Tensor) -> Tensor:
-        """Some weights of all members, int64 [m]: [..., E, m], up to date."""
-        place = self._place[columns]
-        if not self._transformed:
-            return self.matrix[..., 2 + place, :].transpose(-1, -2)
-        behind = place >= self._seen_count
-        found = self._start.new_empty(*self.matrix.shape[:-2], self.matrix.shape[-1], len(columns))
-        found[..., ~behind] = self.matrix[..., 2 + place[~behind], :].transpose(-1, -2)
-        transform = self.matrix[..., 2 + self._seen_count :, :].transpose(-1, -2)
-        found[..., behind] = transform @ self._start[..., 2 + columns[behind]]
-        return found
+    def members(self, columns: Tensor, entry: int | None = None) -> Tensor:
+        """Phase, phase velocity and some weights, int64 [m], up to date: [..., E, 2 + m], a copy.
 
-    def members(self, columns: Tensor) -> Tensor:
-        """Phase, phase velocity and some weights, int64 [m]: [..., E, 2 + m], a copy."""
-        return torch.cat([self.matrix[..., :2, :].transpose(-1, -2), self.weights(columns)], dim=-1)
+        With ``entry`` those of one entry of the batch only, without that dimension.
+        """
+        matrix, start = self.matrix, self._start
+        if entry is not None:
+            matrix, start = matrix[entry], start[entry]
+        place = self._place[columns]
+        found = matrix.new_empty(*matrix.shape[:-2], matrix.shape[-1], 2 + len(columns))
+        found[..., :2] = matrix[..., :2, :].transpose(-1, -2)
+        if not self._transformed:
+            found[..., 2:] = matrix[..., 2 + place, :].transpose(-1, -2)
+            return found
+        behind = place >= self._seen_count
+        found[..., 2:][..., ~behind] = matrix[..., 2 + place[~behind], :].transpose(-1, -2)
+        transform = matrix[..., 2 + self._seen_count :, :].transpose(-1, -2)
+        found[..., 2:][..., behind] = transform @ start[..., 2 + columns[behind]]
+        return found

@@ -40,6 +40,11 @@ class MeasurementNoise(nn.Module):
             groups = int(modality_of_dof.max()) + 1
             self.gates = nn.Parameter(variance.new_zeros(context.n_features, groups))
 
+    @property
+    def depends_on_phase(self) -> bool:
+        """Whether R changes during an interaction."""
+        return self.context is not None
+
     def log_gate(self, phase: Tensor) -> Tensor:
         """Log of the phase-dependent factor of each modality, [..., M] at phases [...]; zeros at the start."""
         if self.context is None or self.gates is None:
@@ -70,6 +75,11 @@ class SelectedNoise(nn.Module):
         super().__init__()
         self.whole = whole
         self.register_buffer("dofs", dofs)
+
+    @property
+    def depends_on_phase(self) -> bool:
+        """Whether R changes during an interaction; assumed of noises that do not say."""
+        return bool(getattr(self.whole, "depends_on_phase", True))
 
     def forward(self, phase: Tensor | None = None) -> Tensor:
         """Standard deviations [k] or [..., k]."""
