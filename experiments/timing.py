@@ -35,7 +35,9 @@ def interleaved(
     before: Callable[[int], object] | None = None,
     warmup: int = 1,
 ) -> dict[Key, Timing]:
-    """Time actions in turn: a round is one call of each.
+    """Time actions in turn: a round is one call of each, in an order that rotates from round to round.
+
+    An action finds caches as the one before it left them; by rotation each follows each.
 
     Args:
         actions: by name.
@@ -48,16 +50,18 @@ def interleaved(
         A timing for each action.
     """
     every = {} if every is None else every
+    order = list(actions)
     taken: dict[Key, list[float]] = {key: [] for key in actions}
     with collected():
         for round_ in range(-warmup, repeats):
             if before is not None:
                 before(round_)
-            for key, action in actions.items():
+            turn = round_ % len(order)
+            for key in order[turn:] + order[:turn]:
                 if round_ % every.get(key, 1):
                     continue
                 began = time.perf_counter()
-                action()
+                actions[key]()
                 seconds = time.perf_counter() - began
                 if round_ >= 0:
                     taken[key].append(seconds)

@@ -141,8 +141,7 @@ class StackedBasis(nn.Module):
             wanted = run.wanted(dofs)
             if wanted:
                 functions = features[run.basis]
-                block = block.reshape(*block.shape[:-1], -1, functions.shape[-1])
-                block = block if len(wanted) == block.shape[-2] else block[..., wanted, :]
+                block = _select(block, run, wanted)
                 parts.append(functions @ block.transpose(-1, -2))
         return torch.cat(parts, dim=-1)
 
@@ -172,11 +171,9 @@ class StackedBasis(nn.Module):
         for run, block in zip(self._runs, self._blocks(weights), strict=True):
             wanted = run.wanted(dofs)
             if wanted:
-                count = run.dofs.stop - run.dofs.start
-                block = block.reshape(*block.shape[:-1], count, -1)
-                values = (block @ features[run.basis].unsqueeze(-1)).squeeze(-1)
-                parts.append(values if len(wanted) == count else values[..., wanted])
-        return torch.cat(parts, dim=-1)
+                block = _select(block, run, wanted)
+                parts.append((block @ features[run.basis].unsqueeze(-1)).squeeze(-1))
+        return torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0]
 
     def _blocks(self, weights: Tensor) -> Sequence[Tensor]:
         """The weights of each run, [..., k]: by one split, whose backward pass is one concatenation."""
@@ -198,3 +195,12 @@ class StackedBasis(nn.Module):
     def extra_repr(self) -> str:
         """Sizes."""
         return f"n_dofs={self.n_dofs}, n_weights={self.n_weights}"
+
+
+def _select(block: Tensor, run: _Run, wanted: list[int]) -> Tensor:
+    """Weights [..., k, B] of some DoFs of a run, whose are [..., n_weights of the run]: a view for neighbours."""
+    block = block.reshape(*block.shape[:-1], run.dofs.stop - run.dofs.start, -1)
+    first, count = wanted[0], len(wanted)
+    if wanted == list(range(first, first + count)):
+        return block.narrow(-2, first, count)
+    return block[..., wanted, :]

@@ -89,7 +89,7 @@ class EnsembleFilter(MemberFilter):
         evidence = state.evidence
         if self.weighting is not None and evidence is not None:
             evidence = self.weighting.forget(evidence, dt)
-        return EnsembleState(self.noise.process(self.dynamics(state.members, dt), dt, generator), evidence)
+        return EnsembleState(self._advance(state.members, dt, generator), evidence)
 
     def _update(
         self, state: EnsembleState, y: Tensor, observed: Tensor, generator: torch.Generator | None

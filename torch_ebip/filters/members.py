@@ -12,9 +12,10 @@ from torch_ebip import functional
 from torch_ebip.filters.base import Filter
 from torch_ebip.filters.evidence import Evidence
 from torch_ebip.filters.forecast import Forecast
-from torch_ebip.filters.interaction import BasisProjection
+from torch_ebip.filters.interaction import BasisProjection, ConstantVelocityPhase
 from torch_ebip.filters.sequence import State
 from torch_ebip.noise.pair import FilterNoise
+from torch_ebip.noise.process import InteractionNoise
 
 
 class EnsembleState(NamedTuple):
@@ -81,6 +82,14 @@ class MemberFilter(Filter):
         if n_members < 2:
             raise ValueError(f"an ensemble needs at least 2 members to have a spread, got {n_members}")
         self.n_members = n_members
+
+    def _advance(self, members: Tensor, dt: Tensor, generator: torch.Generator | None) -> Tensor:
+        """g(x) + N(0, Q)."""
+        moved: Tensor = self.dynamics(members, dt)
+        process = self.noise.process
+        if isinstance(process, InteractionNoise) and isinstance(self.dynamics, ConstantVelocityPhase):
+            return process.add_(moved, dt, generator)  # what this g returns is new: one copy less
+        return process(moved, dt, generator)  # type: ignore[no-any-return]
 
     def project(self, state: State) -> Tensor:
         """See `Filter.project`."""

@@ -105,7 +105,7 @@ class ParticleFilter(MemberFilter):
     def _predict(self, state: ParticleState, dt: Tensor, generator: torch.Generator | None) -> ParticleState:
         """Resample where it is needed, then x = g(x) + N(0, Q)."""
         state = self._resample(state, generator)
-        members = self.noise.process(self.dynamics(state.members, dt), dt, generator)
+        members = self._advance(state.members, dt, generator)
         return ParticleState(members, state.log_weights)
 
     def _resample(self, state: ParticleState, generator: torch.Generator | None) -> ParticleState:

@@ -132,11 +132,14 @@ class InteractionNoise(nn.Module):
 
     def forward(self, members: Tensor, dt: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Members [..., E, n] with noise for steps dt [...] seconds added."""
+        return self.add_(members.clone(), dt, generator)
+
+    def add_(self, members: Tensor, dt: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """The same in place, for members that nobody else holds."""
         factor = self.phase_factor(dt).transpose(-1, -2)
-        moved = members.clone()
-        moved[..., :2] += standard_normal(members[..., :2].shape, members, generator) @ factor
+        members[..., :2] += standard_normal(members[..., :2].shape, members, generator) @ factor
         scale = self._weight_scale(dt)
         if scale is not None:
             draws = standard_normal(members[..., 2:].shape, members, generator)
-            moved[..., 2:] += draws * scale.unsqueeze(-2)
-        return moved
+            members[..., 2:] += draws * scale.unsqueeze(-2)
+        return members

@@ -1,0 +1,1 @@
+"""How fast the filters are, as ratios to things measured in the same run."""
