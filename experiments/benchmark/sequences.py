@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import resource
 import time
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -70,7 +71,7 @@ def fold(repeats: int, seed: int, samples: int = SAMPLES) -> list[dict[str, Any]
 def tuning(seed: int, batch: int = 16, samples: int = SAMPLES) -> list[dict[str, Any]]:
     """Forward and backward pass of 16 x 198 members x 100 steps x 559 weights, each in a process of its own.
 
-    Seconds per interaction, and by how many bytes the process's peak memory grew.
+    Seconds per interaction, and how far the process's peak memory rose above what it held before.
     """
     context = multiprocessing.get_context("spawn")
     rows = []
@@ -101,18 +102,23 @@ def _gradient(sensors: int, segment: int | None, batch: int, samples: int, seed:
 
     with collected():
         run(2)
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        before = _resident()
         seconds = run(samples)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+    peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
     return {
         "sensors": sensors,
         "segment": segment,
         "batch": batch,
         "samples": samples,
         "seconds_per_interaction": seconds / batch,
-        "extra_gigabytes": peak * 1024 / 1e9,
+        "extra_gigabytes": peak / 1e9,
         "finite": all(bool(p.grad.isfinite().all()) for p in filter.parameters() if p.grad is not None),
     }
+
+
+def _resident() -> int:
+    """Bytes that this process holds now."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
 
 def _batch(problem: Problem, count: int, seed: int) -> torch.Tensor:

@@ -18,7 +18,7 @@ class GaussianBasis(CentredBasis):
     def curve(self, distance: Tensor) -> Tensor:
         """See `CentredBasis.curve`."""
         # Far functions are 4e-18, not denormal: products with denormal numbers take a hundred times as long.
-        return torch.mul(distance, distance).neg().clamp(min=-40).exp()
+        return torch.mul(distance, distance).neg_().clamp_(min=-40).exp_()
 
     def slope(self, distance: Tensor, values: Tensor) -> Tensor:
         """See `CentredBasis.slope`."""

@@ -1,0 +1,54 @@
+"""The benchmark compares things that do the same, and takes turns fairly. It asserts no time."""
+
+from importlib.util import find_spec
+
+import pytest
+import torch
+
+from experiments.benchmark import growth, step
+from experiments.benchmark.floor import floor
+from experiments.benchmark.problem import make_problem
+from experiments.benchmark.versions import Loop
+from experiments.timing import interleaved
+
+PEERS = ["live", "loop", "numpy", *(["filterpy"] if find_spec("filterpy") else [])]
+
+
+@pytest.mark.parametrize("sensors", [4, 12])
+def test_all_versions_do_the_same(sensors: int) -> None:
+    problem = make_problem(156, 10, sensors, torch.float64, samples=40)
+    differences = step.check(problem, PEERS, steps=30)
+    assert max(differences.values()) < 1e-9
+
+
+def test_a_version_that_does_something_else_is_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = make_problem(156, 10, 4, torch.float64, samples=40)
+    monkeypatch.setattr(Loop, "step", lambda self, y: None)
+    with pytest.raises(RuntimeError, match="loop differs"):
+        step.check(problem, ["loop"])
+
+
+def test_timings_take_turns() -> None:
+    calls: list[tuple[int, str]] = []
+    rounds: list[int] = []
+    actions = {name: (lambda name=name: calls.append((rounds[-1], name))) for name in "abc"}
+    timings = interleaved(actions, 6, every={"c": 3}, before=rounds.append, warmup=0)
+    assert rounds == list(range(6))
+    assert {name: timing.calls for name, timing in timings.items()} == {"a": 6, "b": 6, "c": 2}
+    assert [name for _, name in calls if _ == 0] == ["a", "b", "c"]
+    assert [name for _, name in calls if _ == 1] == ["b", "a"]
+
+
+def test_the_problem_has_the_size_of_the_paper() -> None:
+    problem = make_problem(559, 80, 10, torch.float32)
+    assert problem.filter.prior.states.shape == (80, 561)
+    assert problem.y.shape == (100, 43)
+    floor(problem)()
+    floor(problem, whole=True)()
+
+
+def test_growth_reports_every_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(growth, "SIZES", {"members": (10, 20), "batch": (1, 2)})
+    rows = growth.growth(3, 0)
+    assert [row["varied"] for row in rows] == ["members", "batch"]
+    assert all(len(row["microseconds"]) == 2 and min(row["microseconds"]) > 0 for row in rows)
