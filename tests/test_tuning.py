@@ -13,6 +13,7 @@ from torch_ebip.losses import ForwardKinematicsLoss
 from torch_ebip.noise import AboveOne
 from torch_ebip.objective import ForecastObjective, Weights
 from torch_ebip.tuning import Tuner, TuningSettings
+from torch_ebip.tuning.partition import Partition
 
 TARGETS = torch.tensor([False, False, False, True, True])
 SUBSETS = {"hand": torch.tensor([True, True, False, False, False]), "both": ~TARGETS}
@@ -37,27 +38,27 @@ def parameters(made: EnsembleFilter) -> dict[str, torch.Tensor]:
 def test_no_ensemble_contains_its_interaction(monkeypatch: pytest.MonkeyPatch) -> None:
     _, tuner = filter_and_tuner()
     seen = []
-    original = type(tuner)._members
+    original = Partition.members
 
     def recording(self, picked, generator):
         members = original(self, picked, generator)
         seen.append((picked, members))
         return members
 
-    monkeypatch.setattr(type(tuner), "_members", recording)
+    monkeypatch.setattr(Partition, "members", recording)
     tuner.run()
     assert len(seen) > 12
     for picked, members in seen:
         assert not (members == picked[:, None]).any()
         assert all(len(set(row.tolist())) == len(row) for row in members)
     trained = torch.cat([picked for picked, _ in seen if len(picked) == 6])
-    assert not set(trained.tolist()) & set(tuner.validating.tolist())
+    assert not set(trained.tolist()) & set(tuner.partition.validating.tolist())
 
 
 @pytest.mark.parametrize("size", [5, 40])
 def test_smaller_and_larger_ensembles(size: int) -> None:
     _, tuner = filter_and_tuner(TuningSettings(n_members=size, folds=4))
-    members = tuner._members(torch.arange(6), torch.Generator().manual_seed(0))
+    members = tuner.partition.members(torch.arange(6), torch.Generator().manual_seed(0))
     assert members.shape == (6, size)
     assert not (members == torch.arange(6)[:, None]).any()
 
@@ -89,7 +90,8 @@ def test_the_gradient_of_a_step_is_that_of_finite_differences() -> None:
 
     def loss() -> torch.Tensor:
         generator = torch.Generator().manual_seed(0)
-        part, trace, context = tuner._filter(torch.arange(4), SUBSETS["both"], shares, generator)
+        members = tuner.partition.members(torch.arange(4), generator)
+        part, trace, context = tuner._filter(torch.arange(4), SUBSETS["both"], shares, members, 0)
         return torch.stack(list(objective(part, trace, *context).values())).sum()
 
     loss().backward()
@@ -187,7 +189,8 @@ def test_a_checkpoint_of_another_start_is_refused(tmp_path: Path) -> None:
 def test_horizons_stay_inside_however_coarse_the_thinning(tmp_path: Path) -> None:
     _, tuner = filter_and_tuner(TuningSettings(folds=4, thinning=10, horizons=(0.9, 1.0)))
     shares = torch.tensor([[0.97, 1.0]]).expand(24, 2)
-    _, trace, (_, _, now, _) = tuner._filter(torch.arange(24), SUBSETS["both"], shares, torch.Generator())
+    members = tuner.partition.members(torch.arange(24), torch.Generator())
+    _, trace, (_, _, now, _) = tuner._filter(torch.arange(24), SUBSETS["both"], shares, members, 0)
     assert now.max() <= 1
     assert trace.kept is not None
 

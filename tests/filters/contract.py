@@ -89,6 +89,30 @@ class FilterContract:
         assert torch.equal(a.projection, b.projection)
         assert torch.equal(before, torch.get_rng_state())
 
+    @pytest.mark.parametrize("gradients", [True, False])
+    @pytest.mark.parametrize("segment", [None, 7])
+    def test_draws_belong_to_the_interaction(self, gradients: bool, segment: int | None) -> None:
+        """With a generator each, an interaction's result does not depend on its company, whatever that measures."""
+        made = self.make(torch.float64)
+        y, observed = self.sequences(torch.float64)
+        observed[0, 9:, 0] = False
+        observed[2, 12:] = False
+
+        def generators(entries: list[int]) -> list[torch.Generator]:
+            """The same ones again."""
+            return [torch.Generator().manual_seed(i) for i in entries]
+
+        with torch.set_grad_enabled(gradients):
+            together = made(y, observed, generator=generators([0, 1, 2]), segment=segment)
+            for entries in ([1], [0, 2]):
+                apart = made(y[entries], observed[entries], generator=generators(entries))
+                torch.testing.assert_close(apart.projection, together.projection[entries])
+                torch.testing.assert_close(apart.log_likelihood, together.log_likelihood[entries])
+        if gradients and together.log_likelihood.requires_grad:
+            together.log_likelihood.sum().backward()  # a checkpointed segment is repeated with the same draws
+        with pytest.raises(ValueError, match="2 generators"):
+            made(y, observed, generator=generators([0, 1]))
+
     @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
     def test_dtype_follows(self, dtype: torch.dtype) -> None:
         made = self.make(dtype)

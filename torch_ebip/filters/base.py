@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torch_ebip.draws import Generators
 from torch_ebip.filters.attribution import affine_coefficients
 from torch_ebip.filters.forecast import Forecast
 from torch_ebip.filters.model import InteractionModel, select_dofs
@@ -78,7 +79,7 @@ class Filter(nn.Module, ABC):
         self,
         batch_shape: tuple[int, ...] = (),
         members: Tensor | None = None,
-        generator: torch.Generator | None = None,
+        generator: Generators = None,
     ) -> State:
         """The state before any observation, at phase 0.
 
@@ -89,13 +90,11 @@ class Filter(nn.Module, ABC):
         """
 
     @abstractmethod
-    def _predict(self, state: State, dt: Tensor, generator: torch.Generator | None) -> State:
+    def _predict(self, state: State, dt: Tensor, generator: Generators) -> State:
         """`predict` with dt as a tensor."""
 
     @abstractmethod
-    def _update(
-        self, state: State, y: Tensor, observed: Tensor, generator: torch.Generator | None
-    ) -> tuple[State, Tensor]:
+    def _update(self, state: State, y: Tensor, observed: Tensor, generator: Generators) -> tuple[State, Tensor]:
         """`update` with arguments that were checked."""
 
     @abstractmethod
@@ -159,7 +158,7 @@ class Filter(nn.Module, ABC):
         """What moves weights out of the span of the demonstrations, if anything does."""
         return "weights have process noise" if getattr(self.noise.process, "weights", None) is not None else None
 
-    def predict(self, state: State, dt: float | Tensor, generator: torch.Generator | None = None) -> State:
+    def predict(self, state: State, dt: float | Tensor, generator: Generators = None) -> State:
         """Propagate by dt seconds: a number, or a tensor [...] with one for each entry of the batch."""
         return self._predict(state, torch.as_tensor(dt, dtype=state[0].dtype, device=state[0].device), generator)
 
@@ -168,7 +167,7 @@ class Filter(nn.Module, ABC):
         state: State,
         y: Tensor,
         observed: Tensor | None = None,
-        generator: torch.Generator | None = None,
+        generator: Generators = None,
     ) -> tuple[State, Tensor]:
         """Take in one sample.
 
@@ -194,7 +193,7 @@ class Filter(nn.Module, ABC):
         observed: Tensor | None = None,
         dt: float | Tensor | None = None,
         state: State | None = None,
-        generator: torch.Generator | None = None,
+        generator: Generators = None,
         *,
         keep: Tensor | None = None,
         segment: int | None = None,
@@ -210,7 +209,8 @@ class Filter(nn.Module, ABC):
             observed: bool [..., T, D]; default: where y is not NaN.
             dt: seconds between samples, a number or [...]; default: that of the demonstrations.
             state: default: `initial_state` of the batch.
-            generator: of all draws.
+            generator: of all draws; or one for each entry of the first batch dimension, so that its draws do not
+                depend on its company.
             keep: int64 [..., K], after which samples (0 = the first) to keep the state of each entry.
             segment: samples a segment of gradient checkpointing; memory for gradients then grows with
                 T / segment + segment instead of T, at the price of a second forward pass. Exact: every
@@ -224,6 +224,8 @@ class Filter(nn.Module, ABC):
         if y.ndim < 2 or y.shape[-2] < 1:
             raise ValueError(f"y must be [..., T, {self.n_dofs}] with at least one sample, got {tuple(y.shape)}")
         batch, length = y.shape[:-2], y.shape[-2]
+        if generator is not None and not isinstance(generator, torch.Generator) and len(generator) != (*batch, 0)[0]:
+            raise ValueError(f"{len(generator)} generators for a batch {list(batch)}: needs one for each entry")
         if state is None:
             state = self.initial_state(batch, generator=generator)
         elif state[0].shape[: len(batch)] != batch:
@@ -240,7 +242,7 @@ class Filter(nn.Module, ABC):
                 return trace
         step = torch.as_tensor(self.dt if dt is None else dt, dtype=state[0].dtype, device=state[0].device)
 
-        def run(state: State, start: int, stop: int, generator: torch.Generator | None) -> Segment:
+        def run(state: State, start: int, stop: int, generator: Generators) -> Segment:
             """Samples start to stop - 1."""
             record = Segment(state, [], [], [], [])
             for t in range(start, stop):
@@ -275,7 +277,7 @@ class Filter(nn.Module, ABC):
         observed: Tensor,
         dt: float | Tensor,
         state: State,
-        generator: torch.Generator | None,
+        generator: Generators,
         keep: Tensor | None,
         project: bool,
     ) -> Trace | None:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_ebip import functional
-from torch_ebip.draws import standard_normal
+from torch_ebip.draws import Generators, is_several, standard_normal
 from torch_ebip.filters.base import Trace
 from torch_ebip.filters.evidence import Evidence, EvidenceWeighting
 from torch_ebip.filters.in_place import filter_in_place
@@ -78,13 +78,13 @@ class EnsembleFilter(MemberFilter):
         self,
         batch_shape: tuple[int, ...] = (),
         members: Tensor | None = None,
-        generator: torch.Generator | None = None,
+        generator: Generators = None,
     ) -> EnsembleState:
         """Step 1 of the paper's algorithm; see `Filter.initial_state`."""
         started = self.prior(batch_shape, self.n_members, members, generator)
         return EnsembleState(started, None if self.weighting is None else self.weighting.start(started))
 
-    def _predict(self, state: EnsembleState, dt: Tensor, generator: torch.Generator | None) -> EnsembleState:
+    def _predict(self, state: EnsembleState, dt: Tensor, generator: Generators) -> EnsembleState:
         """Step 2: x = g(x) + N(0, Q)."""
         evidence = state.evidence
         if self.weighting is not None and evidence is not None:
@@ -92,10 +92,14 @@ class EnsembleFilter(MemberFilter):
         return EnsembleState(self._advance(state.members, dt, generator), evidence)
 
     def _update(
-        self, state: EnsembleState, y: Tensor, observed: Tensor, generator: torch.Generator | None
+        self, state: EnsembleState, y: Tensor, observed: Tensor, generator: Generators
     ) -> tuple[EnsembleState, Tensor]:
         """Step 3: x = x + K (y + eps - h(x)), over the DoFs that some entry of the batch measured."""
         measured = observed.reshape(-1, self.n_dofs).any(0)
+        draws = None
+        if is_several(generator) and not self.square_root:
+            # What one interaction draws may not depend on what others measure.
+            draws = standard_normal((*state.members.shape[:-1], self.n_dofs), state.members, generator)
         if not bool(measured.any()):
             return state, state.members.new_zeros(observed.shape[:-1])
         rows = None if bool(measured.all()) else measured.nonzero().squeeze(-1)
@@ -116,7 +120,10 @@ class EnsembleFilter(MemberFilter):
                     members, projections, y, factor, observed, taper, weights, growth
                 )
             else:
-                draws = standard_normal(projections.shape, members, generator)
+                if draws is None:
+                    draws = standard_normal(projections.shape, members, generator)
+                elif rows is not None:
+                    draws = draws[..., rows]
                 updated, likelihood = functional.ensemble_update(
                     members, projections, y, factor, draws, observed, taper, weights, growth
                 )
@@ -178,7 +185,7 @@ class EnsembleFilter(MemberFilter):
         observed: Tensor,
         dt: float | Tensor,
         state: EnsembleState,
-        generator: torch.Generator | None,
+        generator: Generators,
         keep: Tensor | None,
         project: bool,
     ) -> Trace | None:

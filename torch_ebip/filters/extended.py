@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torch_ebip.basis.base import Basis
+from torch_ebip.draws import Generators
 from torch_ebip.filters.base import Filter
 from torch_ebip.filters.forecast import Forecast
 from torch_ebip.filters.interaction import BasisProjection, ConstantVelocityPhase
@@ -66,12 +67,12 @@ class ExtendedFilter(Filter):
         self,
         batch_shape: tuple[int, ...] = (),
         members: Tensor | None = None,
-        generator: torch.Generator | None = None,
+        generator: Generators = None,
     ) -> GaussianState:
         """The equations of mu_0 and Sigma_0, of all demonstrations or of those named; see `Filter`."""
         return GaussianState(*self.prior(batch_shape, members))
 
-    def _predict(self, state: GaussianState, dt: Tensor, generator: torch.Generator | None) -> GaussianState:
+    def _predict(self, state: GaussianState, dt: Tensor, generator: Generators) -> GaussianState:
         """mu = g(mu), Sigma = G Sigma G' + Q: only the row and the column of the phase change, and Q's blocks."""
         mean, covariance = state
         slope = self._dynamics.slope(mean, dt).unsqueeze(-1)
@@ -90,7 +91,7 @@ class ExtendedFilter(Filter):
         return GaussianState(self._dynamics(mean.unsqueeze(-2), dt).squeeze(-2), moved)
 
     def _update(
-        self, state: GaussianState, y: Tensor, observed: Tensor, generator: torch.Generator | None
+        self, state: GaussianState, y: Tensor, observed: Tensor, generator: Generators
     ) -> tuple[GaussianState, Tensor]:
         """K = Sigma H' S^-1, mu = mu + K (y - h(mu)), Sigma = (I - K H) Sigma (I - K H)' + K R K'."""
         measured = observed.reshape(-1, self.n_dofs).any(0)

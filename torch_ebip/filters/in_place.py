@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from torch_ebip.draws import Generators
 from torch_ebip.filters.base import Trace
 from torch_ebip.filters.live import LiveFilter
 from torch_ebip.filters.members import EnsembleState
@@ -22,7 +23,7 @@ def filter_in_place(
     observed: Tensor,
     dt: float,
     state: EnsembleState,
-    generator: torch.Generator | None,
+    generator: Generators,
     keep: Tensor | None,
     project: bool,
 ) -> Trace:

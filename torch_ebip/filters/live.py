@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torch_ebip.draws import standard_normal
+from torch_ebip.draws import Generators, is_several, standard_normal
 from torch_ebip.filters.evidence import Evidence
 from torch_ebip.filters.forecast import Forecast
 from torch_ebip.filters.interaction import BasisProjection, ConstantVelocityPhase
@@ -63,7 +63,7 @@ class LiveFilter:
         dofs: Tensor | None = None,
         batch_shape: tuple[int, ...] = (),
         members: Tensor | None = None,
-        generator: torch.Generator | None = None,
+        generator: Generators = None,
         state: EnsembleState | None = None,
     ) -> None:
         reason = filter._leaves_span()
@@ -93,7 +93,6 @@ class LiveFilter:
         self._members = self._span.matrix
         self._phase, self._velocity = self._members[..., 0, :], self._members[..., 1, :]
         self._moving = self._members[..., :2, :]
-        self._draws_here = generator is None or generator.device == start.device
         self._draws = start.new_empty(*start.shape[:-1], 2)
         self._draws_by_entry = self._draws.transpose(-1, -2)
         E = start.shape[-2]
@@ -183,6 +182,11 @@ class LiveFilter:
             mask: bool [B, D], which of them each entry did; None if all did.
         """
         plan = self._plan(measured)
+        draws = None
+        if is_several(self.generator) and not self.filter.square_root:
+            # What one interaction draws may not depend on what others measure.
+            E, D = self._members.shape[-1], self.filter.n_dofs
+            draws = standard_normal((*self.batch_shape, E, D), self._members, self.generator)
         if plan is None:
             return y.new_zeros(self.batch_shape)
         values = torch.index_select(y, -1, plan.dofs, out=plan.values).unsqueeze(-1)
@@ -213,7 +217,10 @@ class LiveFilter:
             half = torch.linalg.solve_triangular(factor + torch.diag_embed(deviation[..., 0]), anomalies, upper=False)
             moves = shift - torch.linalg.solve_triangular(factor.transpose(-1, -2), half, upper=True)
         else:
-            self._drawn(plan.draws)
+            if draws is None:
+                self._drawn(plan.draws)
+            else:
+                torch.index_select(draws, -1, plan.dofs, out=plan.draws)
             # y + eps - HX, as (y - mean) + eps - HA: what is not measured is 0 in all of them.
             torch.addcmul(residual, deviation, plan.draws_by_dof, out=plan.right_members).sub_(anomalies)
             torch.cholesky_solve(plan.right, factor, out=plan.solved)
@@ -227,8 +234,9 @@ class LiveFilter:
 
     def _drawn(self, buffer: Tensor) -> Tensor:
         """The buffer, filled with standard-normal draws: those that `standard_normal` would make."""
-        if self._draws_here:
-            return buffer.normal_(generator=self.generator)
+        generator = self.generator
+        if generator is None or (isinstance(generator, torch.Generator) and generator.device == buffer.device):
+            return buffer.normal_(generator=generator)
         return buffer.copy_(standard_normal(buffer.shape, buffer, self.generator))
 
     def _move(self, weighted: Tensor, moves: Tensor, share: float, even: Tensor, seen: Tensor | None) -> None:

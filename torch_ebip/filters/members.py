@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_ebip import functional
+from torch_ebip.draws import Generators
 from torch_ebip.filters.base import Filter
 from torch_ebip.filters.evidence import Evidence
 from torch_ebip.filters.forecast import Forecast
@@ -83,7 +84,7 @@ class MemberFilter(Filter):
             raise ValueError(f"an ensemble needs at least 2 members to have a spread, got {n_members}")
         self.n_members = n_members
 
-    def _advance(self, members: Tensor, dt: Tensor, generator: torch.Generator | None) -> Tensor:
+    def _advance(self, members: Tensor, dt: Tensor, generator: Generators) -> Tensor:
         """g(x) + N(0, Q)."""
         moved: Tensor = self.dynamics(members, dt)
         process = self.noise.process

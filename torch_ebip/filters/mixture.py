@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torch_ebip.draws import standard_normal
+from torch_ebip.draws import Generators, standard_normal, uniform
 from torch_ebip.filters.priors import check_members, check_states
 
 
@@ -44,7 +44,7 @@ class MixturePrior(nn.Module):
         batch_shape: tuple[int, ...],
         n_members: int,
         members: Tensor | None = None,
-        generator: torch.Generator | None = None,
+        generator: Generators = None,
     ) -> Tensor:
         """Independent draws [*batch_shape, n_members, n].
 
@@ -66,8 +66,7 @@ class MixturePrior(nn.Module):
         totals = shares.sum(-2).clamp(min=torch.finfo(shares.dtype).tiny)  # [..., K], demonstrations a component
         proportions = (totals / totals.sum(-1, keepdim=True)).cumsum(-1)
         size = (*batch_shape, n_members)
-        device = states.device if generator is None else generator.device
-        u = torch.rand(size, dtype=states.dtype, generator=generator, device=device).to(states.device)
+        u = uniform(size, states, generator)
         component = (u.unsqueeze(-1) > proportions.unsqueeze(-2)[..., :-1]).sum(-1)  # [..., E]
         within = (shares / totals.unsqueeze(-2)).transpose(-1, -2).expand(*batch_shape, -1, -1)  # [..., K, M]
         share = within.gather(-2, component.unsqueeze(-1).expand(*size, count))  # [..., E, M], rows sum to 1

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from torch_ebip import functional
 from torch_ebip.basis.base import Basis
+from torch_ebip.draws import Generators, uniform
 from torch_ebip.filters.members import MemberFilter
 from torch_ebip.filters.model import demonstration_states, interaction_model
 from torch_ebip.filters.priors import DemonstrationPrior, select_prior
@@ -95,31 +96,30 @@ class ParticleFilter(MemberFilter):
         self,
         batch_shape: tuple[int, ...] = (),
         members: Tensor | None = None,
-        generator: torch.Generator | None = None,
+        generator: Generators = None,
     ) -> ParticleState:
         """See `Filter.initial_state`."""
         started: Tensor = self.prior(batch_shape, self.n_members, members, generator)
         count = started.shape[-2]
         return ParticleState(started, started.new_full(started.shape[:-1], -math.log(count)))
 
-    def _predict(self, state: ParticleState, dt: Tensor, generator: torch.Generator | None) -> ParticleState:
+    def _predict(self, state: ParticleState, dt: Tensor, generator: Generators) -> ParticleState:
         """Resample where it is needed, then x = g(x) + N(0, Q)."""
         state = self._resample(state, generator)
         members = self._advance(state.members, dt, generator)
         return ParticleState(members, state.log_weights)
 
-    def _resample(self, state: ParticleState, generator: torch.Generator | None) -> ParticleState:
+    def _resample(self, state: ParticleState, generator: Generators) -> ParticleState:
         batch, count = state.log_weights.shape[:-1], state.log_weights.shape[-1]
-        device = state.members.device if generator is None else generator.device
         # Drawn whether it is needed or not, so that later draws do not depend on the measurements.
-        u = torch.rand(batch, dtype=state.members.dtype, generator=generator, device=device).to(state.members.device)
+        u = uniform(batch, state.members, generator)
         needed = state.effective_size < self.threshold * count
         if not bool(needed.any()):
             return state
         proposal, ratio = state.log_weights, torch.zeros_like(state.log_weights)
         if self.softness:
-            uniform = torch.full_like(proposal, math.log(self.softness / count))
-            proposal = torch.logaddexp(proposal + math.log1p(-self.softness), uniform)
+            even = torch.full_like(proposal, math.log(self.softness / count))
+            proposal = torch.logaddexp(proposal + math.log1p(-self.softness), even)
             ratio = state.log_weights - proposal
         ancestors = functional.systematic_resample(proposal.detach(), u)
         ancestors = torch.where(needed.unsqueeze(-1), ancestors, torch.arange(count, device=u.device))
@@ -128,7 +128,7 @@ class ParticleFilter(MemberFilter):
         return ParticleState(members, torch.where(needed.unsqueeze(-1), resampled, state.log_weights))
 
     def _update(
-        self, state: ParticleState, y: Tensor, observed: Tensor, generator: torch.Generator | None
+        self, state: ParticleState, y: Tensor, observed: Tensor, generator: Generators
     ) -> tuple[ParticleState, Tensor]:
         """w = w N(y; h(x), R), over the DoFs that were measured."""
         measured = observed.reshape(-1, self.n_dofs).any(0)

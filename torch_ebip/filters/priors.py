@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from torch_ebip.draws import standard_normal
+from torch_ebip.draws import Generators, integers, standard_normal
 
 
 class DemonstrationPrior(nn.Module):
@@ -29,7 +29,7 @@ class DemonstrationPrior(nn.Module):
         batch_shape: tuple[int, ...],
         n_members: int,
         members: Tensor | None = None,
-        generator: torch.Generator | None = None,
+        generator: Generators = None,
     ) -> Tensor:
         """Initial members [*batch_shape, E, n].
 
@@ -48,8 +48,7 @@ class DemonstrationPrior(nn.Module):
             if n_members == count:
                 return self.states.expand(*batch_shape, -1, -1)
             shape = (*batch_shape, n_members)
-            device = self.states.device if generator is None else generator.device
-            members = torch.randint(count, shape, generator=generator, device=device).to(self.states.device)
+            members = integers(count, shape, self.states.device, generator)
         check_members(members, count)
         return self.states[members.expand(*batch_shape, members.shape[-1]) if batch_shape else members]
 
@@ -159,7 +158,7 @@ class GaussianPrior(nn.Module):
         batch_shape: tuple[int, ...],
         n_members: int,
         members: Tensor | None = None,
-        generator: torch.Generator | None = None,
+        generator: Generators = None,
     ) -> Tensor:
         """Independent draws [*batch_shape, E, n]; ``members`` must be None."""
         if members is not None:

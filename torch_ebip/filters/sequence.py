@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from torch_ebip.draws import Generators, replayed, set_states, states_of
+
 State = Any
 """A NamedTuple of tensors with leading batch dimensions; every filter has its own."""
 
@@ -24,28 +26,25 @@ class Segment(NamedTuple):
     kept: list[tuple[tuple[int, ...], State]]
 
 
-def checkpointed(
-    run: Callable[..., Segment], state: State, start: int, stop: int, generator: torch.Generator | None
-) -> Segment:
+def checkpointed(run: Callable[..., Segment], state: State, start: int, stop: int, generator: Generators) -> Segment:
     """Run a segment so that its backward pass repeats it with the same draws.
 
     The global generator is saved by torch's own checkpointing; an explicit one is replayed from its state.
     """
     if generator is None:
         return checkpoint(run, state, start, stop, None, use_reentrant=False)  # type: ignore[no-any-return]
-    beginning = generator.get_state()
+    beginning = states_of(generator)
     ends = []
 
     def replay(state: State) -> Segment:
         """The segment with the draws of the first time."""
-        again = torch.Generator(generator.device)
-        again.set_state(beginning)
+        again = replayed(generator, beginning)
         done = run(state, start, stop, again)
-        ends.append(again.get_state())
+        ends.append(states_of(again))
         return done
 
     done = checkpoint(replay, state, use_reentrant=False)
-    generator.set_state(ends[0])
+    set_states(generator, ends[0])
     return done  # type: ignore[no-any-return]
 
 

@@ -7,14 +7,14 @@ import math
 import torch
 from torch import Tensor, nn
 
-from torch_ebip.draws import standard_normal
+from torch_ebip.draws import Generators, standard_normal
 from torch_ebip.noise.constraints import Positive
 
 
 class NoProcessNoise(nn.Module):
     """Q = 0, for dynamics that bring their own noise or need none."""
 
-    def forward(self, members: Tensor, dt: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    def forward(self, members: Tensor, dt: Tensor, generator: Generators = None) -> Tensor:
         """The members [..., E, n] as they are."""
         return members
 
@@ -130,11 +130,11 @@ class InteractionNoise(nn.Module):
         scale = self.weights.scale(dt)
         return scale if self.columns is None else scale[..., self.columns]
 
-    def forward(self, members: Tensor, dt: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    def forward(self, members: Tensor, dt: Tensor, generator: Generators = None) -> Tensor:
         """Members [..., E, n] with noise for steps dt [...] seconds added."""
         return self.add_(members.clone(), dt, generator)
 
-    def add_(self, members: Tensor, dt: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    def add_(self, members: Tensor, dt: Tensor, generator: Generators = None) -> Tensor:
         """The same in place, for members that nobody else holds."""
         factor = self.phase_factor(dt).transpose(-1, -2)
         members[..., :2] += standard_normal(members[..., :2].shape, members, generator) @ factor

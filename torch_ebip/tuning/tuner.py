@@ -21,10 +21,13 @@ from torch import Tensor, nn
 
 from torch_ebip.checkpoint import load_checkpoint, save_checkpoint
 from torch_ebip.demonstrations import Demonstrations
+from torch_ebip.draws import seeded
 from torch_ebip.filters.base import Filter, Trace
 from torch_ebip.monitor import Monitor
 from torch_ebip.objective import ForecastObjective
 from torch_ebip.primitive import InteractionPrimitive
+from torch_ebip.ranks import Ranks
+from torch_ebip.tuning.partition import Partition
 from torch_ebip.tuning.settings import TuningResult, TuningSettings
 
 
@@ -42,10 +45,15 @@ class Tuner:
         monitor: where to report; default: nowhere.
         checkpoint: path of a file to continue from if it exists, and to write after each validation.
         progress: called after each step with the step, the training loss and the last validation loss.
+        ranks: the processes that share the work, each with arguments alike: each filters its part of the
+            interactions, and all take the same steps. The first one writes the checkpoint. Draws belong to
+            interactions, so the result does not depend on their number, beyond rounding (and beyond unequal
+            numbers of measurements, if the objective has an innovation term).
 
     Raises:
         ValueError: demonstrations that are not the prior's; fewer than two folds or too few demonstrations for
-            them; no parameter matches ``only``; a checkpoint of another configuration.
+            them; no parameter matches ``only``; a checkpoint of another configuration; more processes than
+            interactions a step or kept for validation.
     """
 
     def __init__(
@@ -60,6 +68,7 @@ class Tuner:
         monitor: Monitor | None = None,
         checkpoint: str | os.PathLike[str] | None = None,
         progress: Callable[[int, float, float], None] | None = None,
+        ranks: Ranks | None = None,
     ) -> None:
         if len(primitive) != len(demonstrations):
             raise ValueError(f"{len(demonstrations)} demonstrations, but the primitive has {len(primitive)}")
@@ -72,9 +81,10 @@ class Tuner:
         self.targets = targets.to(device)
         self.subsets = {name: subset.to(device) for name, subset in subsets.items()}
         self.monitor, self.progress = monitor, progress
+        self.ranks = Ranks() if ranks is None else ranks
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
         self.layout = demonstrations.layout
-        self.values, self.observed = demonstrations.pad()
+        self.values, self.observed = (tensor.to(device) for tensor in demonstrations.pad())
         self.lengths = demonstrations.lengths.to(device)
         self.parameters = {
             name: parameter
@@ -84,7 +94,10 @@ class Tuner:
         if not self.parameters:
             names = ", ".join(name for name, _ in filter.named_parameters())
             raise ValueError(f"no parameter matches {self.settings.only}; there are {names}")
-        self._split(len(demonstrations))
+        self.partition = Partition(len(demonstrations), self.settings)
+        fewest = min(self.settings.batch_size, len(self.partition.training), len(self.partition.validating))
+        if self.ranks.size > fewest:
+            raise ValueError(f"{self.ranks.size} processes, but only {fewest} interactions to share among them")
 
     def run(self) -> TuningResult:
         """Tune, and leave the parameters of the best validation in the filter."""
@@ -113,38 +126,24 @@ class Tuner:
         kept = min(history, key=lambda key: history[key])
         return TuningResult(kept, history, step < settings.steps, time.monotonic() - began)
 
-    def _split(self, count: int) -> None:
-        """Validation interactions, training interactions, and for each the members of its ensemble."""
-        settings = self.settings
-        held = max(1, round(settings.validation * count))
-        if settings.folds < 2 or count - held < 1 or count < 2 * settings.folds:
-            raise ValueError(f"{count} demonstrations are too few for {settings.folds} folds and validation")
-        order = torch.randperm(count, generator=torch.Generator().manual_seed(settings.seed))
-        self.validating, self.training = order[:held], order[held:]
-        part = torch.empty(count, dtype=torch.long)
-        part[order] = torch.arange(count) % settings.folds
-        others = [(part != fold).nonzero().squeeze(-1) for fold in range(settings.folds)]
-        size = min(len(group) for group in others)
-        self._part, self._others = part, torch.stack([group[:size] for group in others])
-
-    def _members(self, interactions: Tensor, generator: torch.Generator) -> Tensor:
-        """Indices [B, E] of demonstrations outside each interaction's own fold."""
-        others = self._others[self._part[interactions]]
-        size = self.settings.n_members
-        if size is None or size == others.shape[1]:
-            return others
-        if size > others.shape[1]:
-            return others.gather(1, torch.randint(others.shape[1], (len(others), size), generator=generator))
-        return others.gather(1, torch.rand(others.shape, generator=generator).argsort(-1)[:, :size])
-
     def _filter(
-        self, interactions: Tensor, subset: Tensor, shares: Tensor, generator: torch.Generator
+        self, interactions: Tensor, subset: Tensor, shares: Tensor, members: Tensor, key: int
     ) -> tuple[Filter, Trace, tuple[Any, ...]]:
-        """Filter some interactions [B], shown a subset [D] of sensors, up to shares [B, K] of their length."""
+        """Filter this process's part of some interactions.
+
+        Args:
+            interactions: int64 [B].
+            subset: bool [D], of sensors that are shown.
+            shares: [B, K], up to which parts of their length.
+            members: int64 [B, E], their ensembles.
+            key: of the draws, with the seed and the interaction.
+        """
+        mine = slice(self.ranks.rank, None, self.ranks.size)
+        interactions, shares, members = interactions[mine], shares[mine], members[mine]
+        draws = [seeded(self.settings.seed, key, interaction) for interaction in interactions.tolist()]
         kept_dofs = subset | self.targets
         stride, device = self.settings.thinning, self.lengths.device
-        members = self._members(interactions, generator).to(device)
-        interactions, shares = interactions.to(device), shares.to(device)
+        interactions, shares, members = interactions.to(device), shares.to(device), members.to(device)
         part = self.filter.restrict(kept_dofs, stride)
         last = (self.lengths[interactions] - 1).unsqueeze(-1)
         steps = torch.minimum((shares * last / stride).round().long(), last // stride)
@@ -153,11 +152,9 @@ class Tuner:
         observed = self.observed[interactions, ::stride][:, :length][..., kept_dofs] & subset[kept_dofs]
         within = torch.arange(length, device=steps.device).view(1, -1, 1) <= steps.amax(-1).view(-1, 1, 1)
         observed = observed & within
-        state = part.initial_state((len(interactions),), members, generator)
+        state = part.initial_state((len(interactions),), members, draws)
         segment = self.settings.segment if torch.is_grad_enabled() else None
-        trace = part(
-            y, observed, state=state, generator=generator, keep=steps, segment=segment or None, project=False
-        )
+        trace = part(y, observed, state=state, generator=draws, keep=steps, segment=segment or None, project=False)
         now = (steps * stride / last).to(y)
         weights = self.primitive.weights[interactions, None, None, :]
         truth = self.primitive.basis.project(self.objective.phases_ahead(now), weights)[..., self.targets]
@@ -166,33 +163,38 @@ class Tuner:
     def _step(self, step: int, optimizer: torch.optim.Optimizer) -> float:
         settings, began = self.settings, time.monotonic()
         generator = torch.Generator().manual_seed(_mix(settings.seed, step))
-        picked = torch.randperm(len(self.training), generator=generator)[: settings.batch_size]
+        picked = torch.randperm(len(self.partition.training), generator=generator)[: settings.batch_size]
         name = list(self.subsets)[int(torch.randint(len(self.subsets), (), generator=generator))]
         low, high = settings.horizons
         draws = torch.rand(len(picked), settings.horizons_each, generator=generator)
-        part, trace, context = self._filter(
-            self.training[picked], self.subsets[name], low + (high - low) * draws, generator
-        )
+        picked = self.partition.training[picked]
+        members = self.partition.members(picked, generator)
+        part, trace, context = self._filter(picked, self.subsets[name], low + (high - low) * draws, members, step)
         terms = self.objective(part, trace, *context)
         terms["pull"] = settings.pull * self._distance()
-        loss = torch.stack(list(terms.values())).sum()
         optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
+        weight = len(context[0]) / len(picked)
+        (weight * torch.stack(list(terms.values())).sum()).backward()  # type: ignore[no-untyped-call]
+        # The pull sees every parameter, so that all have a gradient.
+        self.ranks.add_up([parameter.grad for parameter in self.parameters.values() if parameter.grad is not None])
+        values = {key: float(value.detach()) for key, value in terms.items()}
+        values["samples"] = int(context[0].any(-1).sum()) / weight
+        values = self.ranks.mean(values, weight)
+        samples = values.pop("samples")
+        total = sum(values.values())
         norm = float(nn.utils.clip_grad_norm_(self.parameters.values(), settings.clip, error_if_nonfinite=True))
         for group in optimizer.param_groups:
             group["lr"] = settings.learning_rate * 0.5 * (1 + math.cos(math.pi * step / (settings.steps + 1)))
         optimizer.step()
         if self.monitor is not None:
-            samples = int(context[0].any(-1).sum())
-            scalars = {f"train/{key}": float(value.detach()) for key, value in terms.items()}
-            total = float(loss.detach())
+            scalars = {f"train/{key}": value for key, value in values.items()}
             scalars |= {"train/loss": total, f"train_subset/{name}": total, "gradient/norm": norm}
             scalars["throughput/samples_per_second"] = samples / (time.monotonic() - began)
             for key, parameter in self.parameters.items():
                 if parameter.grad is not None:
                     scalars[f"gradient/{key}"] = float(parameter.grad.norm())
             self.monitor.scalars(scalars, step)
-        return float(loss.detach())
+        return total
 
     @torch.no_grad()
     def evaluate(self, interactions: Tensor | None = None, shares: Tensor | None = None) -> dict[str, float]:
@@ -207,23 +209,28 @@ class Tuner:
             ``loss``, its terms, ``subset/NAME`` the loss of each subset, and ``spread`` and ``error`` of the
             forecasts of the end in units of the targets' spread over the demonstrations.
         """
-        interactions = self.validating if interactions is None else interactions
+        interactions = self.partition.validating if interactions is None else interactions
         low, high = self.settings.horizons
         shares = low + (high - low) * (torch.arange(4) + 0.5) / 4 if shares is None else shares
+        if self.ranks.size > len(interactions):
+            raise ValueError(f"{self.ranks.size} processes, but only {len(interactions)} interactions to share")
         totals: dict[str, list[float]] = {}
-        spreads = []
         for name, subset in self.subsets.items():
-            generator = torch.Generator().manual_seed(_mix(self.settings.seed, -1))
-            part, trace, context = self._filter(interactions, subset, shares.expand(len(interactions), -1), generator)
-            terms = self.objective(part, trace, *context)
-            for key, value in terms.items():
-                totals.setdefault(key, []).append(float(value))
-            totals.setdefault(f"subset/{name}", []).append(sum(float(value) for value in terms.values()))
-            spreads.append(self.objective.spread_and_error(part, trace, context[1], context[3]))
+            members = self.partition.members(
+                interactions, torch.Generator().manual_seed(_mix(self.settings.seed, -1))
+            )
+            every = shares.expand(len(interactions), -1)
+            part, trace, context = self._filter(interactions, subset, every, members, -1)
+            terms = {key: float(value) for key, value in self.objective(part, trace, *context).items()}
+            terms[f"subset/{name}"] = sum(terms.values())
+            squares = self.objective.spread_and_error(part, trace, context[1], context[3]).square()
+            terms["spread"], terms["error"] = squares.tolist()
+            for key, value in self.ranks.mean(terms, len(context[0])).items():
+                totals.setdefault(key, []).append(value)
         means = {key: sum(values) / len(values) for key, values in totals.items()}
-        means["loss"] = sum(value for key, value in means.items() if not key.startswith("subset/"))
-        means["spread"], means["error"] = torch.stack(spreads).square().mean(0).sqrt().tolist()
-        return means
+        spread, error = math.sqrt(means.pop("spread")), math.sqrt(means.pop("error"))
+        loss = sum(value for key, value in means.items() if not key.startswith("subset/"))
+        return {**means, "loss": loss, "spread": spread, "error": error}
 
     def _validate(self, step: int) -> float:
         scores = self.evaluate()
@@ -267,7 +274,7 @@ class Tuner:
     def _save(
         self, step: int, optimizer: torch.optim.Optimizer, best: Mapping[str, Tensor], history: Mapping[int, float]
     ) -> None:
-        if self.checkpoint is not None:
+        if self.checkpoint is not None and self.ranks.first:
             content = {
                 "step": step,
                 "parameters": self._snapshot(),

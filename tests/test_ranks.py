@@ -1,0 +1,89 @@
+"""Several processes: the numbers of one, and a run that survives the loss of one of them."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from torch_ebip.draws import seeded
+from torch_ebip.ranks import Ranks
+
+ROOT = Path(__file__).parents[1]
+
+
+def launch(count: int, folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """torchrun of the small program."""
+    folder.mkdir(exist_ok=True)
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(count)]
+    return subprocess.run(
+        [*command, "-m", "tests.ranks_program", str(folder), *arguments],
+        cwd=ROOT, env={**os.environ, "OMP_NUM_THREADS": "1"}, capture_output=True, text=True, check=False, timeout=300,
+    )  # fmt: skip
+
+
+def outcome(folder: Path) -> dict:
+    return json.loads((folder / "outcome.json").read_text())
+
+
+def assert_same(a: dict, b: dict) -> None:
+    assert a["validation"].keys() == b["validation"].keys()
+    for step, loss in a["validation"].items():
+        assert b["validation"][step] == pytest.approx(loss, rel=1e-4)
+    for name, values in a["parameters"].items():
+        torch.testing.assert_close(
+            torch.tensor(b["parameters"][name]), torch.tensor(values), rtol=1e-3, atol=1e-3, msg=name
+        )
+
+
+def test_the_result_does_not_depend_on_the_number_of_processes(tmp_path: Path) -> None:
+    for count in (1, 2, 3):
+        done = launch(count, tmp_path / str(count))
+        assert done.returncode == 0, done.stderr
+    for count in (2, 3):
+        assert_same(outcome(tmp_path / "1"), outcome(tmp_path / str(count)))
+        assert outcome(tmp_path / str(count))["words"] == "from the first"
+        assert outcome(tmp_path / str(count))["ranks"] == list(range(count))
+
+
+def test_a_killed_process_ends_the_run_which_resumes_with_another_number(tmp_path: Path) -> None:
+    assert launch(1, tmp_path / "whole").returncode == 0
+    killed = launch(2, tmp_path / "killed", "5")
+    assert killed.returncode != 0
+    assert "run it again to go on" in killed.stderr
+    assert (tmp_path / "killed" / "c.pt").exists()
+    assert not (tmp_path / "killed" / "outcome.json").exists()
+    resumed = launch(3, tmp_path / "killed")
+    assert resumed.returncode == 0, resumed.stderr
+    assert_same(outcome(tmp_path / "whole"), outcome(tmp_path / "killed"))
+
+
+def test_one_process_needs_no_group() -> None:
+    ranks = Ranks.start()
+    assert (ranks.rank, ranks.size, ranks.first) == (0, 1, True)
+    assert ranks.mean({"a": 2.0}, 3.0) == {"a": 2.0}
+    assert ranks.gather("x") == ["x"]
+    assert ranks.shard([1, 2, 3]) == [1, 2, 3]
+    with pytest.raises(ValueError, match="as it was"):
+        ranks.from_first(_fail)
+
+
+def _fail() -> None:
+    raise ValueError("as it was")
+
+
+def test_shards_are_a_partition() -> None:
+    parts = [Ranks(rank, 3).shard(list(range(10))) for rank in range(3)]
+    assert sorted(sum(parts, [])) == list(range(10))
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+
+
+def test_seeds_of_neighbours_share_no_stream() -> None:
+    draws = {
+        tuple(torch.rand(2, generator=seeded(a, b, c)).tolist()) for a in range(3) for b in (-1, 0, 1) for c in (0, 1)
+    }
+    assert len(draws) == 18
+    assert torch.equal(torch.rand(2, generator=seeded(1, 2)), torch.rand(2, generator=seeded(1, 2)))
