@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -21,8 +22,13 @@ def launch(count: int, folder: Path, *arguments: str) -> subprocess.CompletedPro
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(count)]
     return subprocess.run(
         [*command, "-m", "tests.ranks_program", str(folder), *arguments],
-        cwd=ROOT, env={**os.environ, "OMP_NUM_THREADS": "1"}, capture_output=True, text=True, check=False, timeout=300,
-    )  # fmt: skip
+        cwd=ROOT,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
 
 
 def outcome(folder: Path) -> dict:
@@ -77,13 +83,12 @@ def _fail() -> None:
 
 def test_shards_are_a_partition() -> None:
     parts = [Ranks(rank, 3).shard(list(range(10))) for rank in range(3)]
-    assert sorted(sum(parts, [])) == list(range(10))
+    assert sorted(item for part in parts for item in part) == list(range(10))
     assert max(map(len, parts)) - min(map(len, parts)) <= 1
 
 
 def test_seeds_of_neighbours_share_no_stream() -> None:
-    draws = {
-        tuple(torch.rand(2, generator=seeded(a, b, c)).tolist()) for a in range(3) for b in (-1, 0, 1) for c in (0, 1)
-    }
+    keys = product(range(3), (-1, 0, 1), (0, 1))
+    draws = {tuple(torch.rand(2, generator=seeded(*key)).tolist()) for key in keys}
     assert len(draws) == 18
     assert torch.equal(torch.rand(2, generator=seeded(1, 2)), torch.rand(2, generator=seeded(1, 2)))
