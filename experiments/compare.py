@@ -4,6 +4,8 @@ Methods: `bip`, `particle_filter`, `ebip_minus` and `ebip` are the paper's; `ebi
 best single factor; `ebip_tuned` and `particle_filter_tuned` are tuned by gradient; all of that happens inside each
 fold, never on its test part. `mean`, `nearest`, `ridge`, `trees`, `gru` and, for the simulated ball, `ballistic`
 are what one would try without a filter. Without --data the recordings are the simulated ball catching.
+
+`torchrun --nproc-per-node K -m experiments.compare` shares the folds among K processes; the result is the same.
 """
 
 from __future__ import annotations
@@ -20,11 +22,12 @@ from experiments.data import choose_subsets, load, thinning
 from experiments.entries import METHODS, Fold
 from experiments.evaluate import evaluate
 from experiments.figures import results_figure
-from experiments.folds import mean_of_cells, read_values, run_folds, share_cores, split, write_values
+from experiments.folds import LOST, mean_of_cells, read_values, run_folds, share_cores, split, write_values
 from experiments.paper_table import paper_rows
 from experiments.results import Values, markdown, print_tables, summarise
 from experiments.run_folder import RunFolder, write_json
 from torch_ebip.files import atomic_write
+from torch_ebip.ranks import RankLostError, Ranks
 from torch_ebip.tuning import TuningSettings
 
 
@@ -42,6 +45,7 @@ class Job:
     seed: int
     scan: int
     threads: int
+    device: str
     folder: str
     tuning: TuningSettings
 
@@ -49,6 +53,7 @@ class Job:
 def run_fold(job: Job) -> Values:
     """Build and evaluate every method of one fold; what is finished is read from the fold's folder."""
     torch.set_num_threads(job.threads)
+    device = torch.device(job.device)
     folder = Path(job.folder)
     demonstrations, task = load(job.data, job.demonstrations, job.seed)
     task = choose_subsets(task, demonstrations.layout, job.subsets, alone=job.data is not None)
@@ -61,7 +66,7 @@ def run_fold(job: Job) -> Values:
         if not finished.exists():
             began = time.monotonic()
             if fold is None:
-                fold = Fold.of(known, task, job.seed, job.tuning, folder, job.members, job.scan)
+                fold = Fold.of(known, task, job.seed, job.tuning, folder, job.members, job.scan, device)
             method = METHODS[name](fold)
             built = time.monotonic()
             values = {} if method is None else evaluate(task, {name: method}, tests)
@@ -77,11 +82,13 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the experiment from the command line."""
     options = _parser().parse_args(arguments)
     began = time.monotonic()
+    ranks = Ranks.start()
     tuning = TuningSettings(seed=options.seed, steps=options.steps)
     count, scan = options.demonstrations, 24
     if options.quick:
         tuning = replace(tuning, steps=min(options.steps, 10), batch_size=8, validate_every=5)
         count, scan = min(count, 60), 8
+    ranks.from_first(lambda: load(options.data, count, options.seed) and None)  # simulated once, then kept
     demonstrations, task = load(options.data, count, options.seed)
     task = choose_subsets(task, demonstrations.layout, options.subsets, alone=options.data is not None)
     tuning = replace(tuning, thinning=thinning(demonstrations))
@@ -106,14 +113,17 @@ def main(arguments: list[str] | None = None) -> None:
         "scan": scan,
         "tuning": asdict(tuning),
     }
-    run = RunFolder("compare", settings, options.out, options.force)
+    run = ranks.from_first(lambda: RunFolder("compare", settings, options.out, options.force))
+    ranks.explain_on_termination(LOST.format(run.path))
     workers, threads = share_cores(folds, options.workers)
+    threads = threads if ranks.size == 1 else torch.get_num_threads()
     jobs = [
         Job(fold, folds, options.data, count, tuple(options.subsets), tuple(options.methods), options.members,
-            options.seed, scan, threads, str(run.path / f"fold-{fold:02d}"), tuning)
+            options.seed, scan, threads, str(ranks.device), str(run.path / f"fold-{fold:02d}"), tuning)
         for fold in range(folds)
     ]  # fmt: skip
-    print(demonstrations)
+    if ranks.first:
+        print(demonstrations)
     shown = [name for name in ("ebip_tuned", "ebip_scaled", "trees") if name in options.methods][:2]
 
     def headline(values: Values) -> str:
@@ -121,9 +131,14 @@ def main(arguments: list[str] | None = None) -> None:
         return ", ".join(f"{name} mae {mean_of_cells(values, name, 'mae'):.4f}" for name in shown)
 
     try:
-        values = run_folds(run_fold, jobs, workers, headline)
+        values = run_folds(run_fold, jobs, workers, headline, ranks)
     except (ValueError, ImportError) as error:
         raise SystemExit(f"{run.path}: {error}") from error
+    except RankLostError as error:
+        raise SystemExit(LOST.format(run.path)) from error
+    ranks.stop()
+    if not ranks.first:
+        return
     seconds: dict[str, float] = {}
     for path in sorted(run.path.glob("fold-*/*-seconds.json")):
         spent = sum(json.loads(path.read_text()).values())

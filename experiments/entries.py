@@ -7,6 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
+
 from experiments.baselines import (
     BallisticMethod,
     RecurrentMethod,
@@ -70,10 +72,11 @@ class Fold:
         folder: Path,
         members: int | None = None,
         scan: int = 48,
+        device: torch.device | None = None,
     ) -> Fold:
         """Basis by BIC and the primitive of the training demonstrations, and what is tuned for."""
         layout = known.layout
-        primitive = InteractionPrimitive.fit(known, select_basis(known))
+        primitive = InteractionPrimitive.fit(known, select_basis(known)).to(device)
         subsets = {subset: layout.mask(names) for subset, names in task.subsets.items()}
         arm = None if task.arm is None else (task.arm[0], layout.mask([task.arm[1]]))
         problem = Problem(known, primitive, layout.mask(task.targets), subsets, arm)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, Protocol
 
@@ -12,6 +13,7 @@ from torch import Tensor
 from experiments.results import Cell, Values
 from torch_ebip import Demonstrations, Filter, Forecast, InteractionPrimitive
 from torch_ebip import metrics as measure
+from torch_ebip.draws import seeded
 from torch_ebip.kinematics import RobotArm
 
 
@@ -55,28 +57,38 @@ class Method(Protocol):
 
 
 class FilterMethod:
-    """A filter, with draws of its own seed."""
+    """A filter, on the device where it is.
 
-    def __init__(self, filter: Filter, seed: int) -> None:
-        self.filter, self.seed = filter, seed
+    Args:
+        filter: that answers.
+        seed: of the draws; each interaction has its own.
+        numbers: of the interactions that will be asked about, for their draws; default: 0, 1, ...
+    """
+
+    def __init__(self, filter: Filter, seed: int, numbers: Sequence[int] | None = None) -> None:
+        self.filter, self.seed, self.numbers = filter, seed, numbers
 
     @torch.no_grad()
     def __call__(self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor) -> Answer:
         """See `Method`. DoFs that are neither shown nor asked for are left out of the filter."""
         used = observed.any(0).any(0) | dofs
         part = self.filter.restrict(used)
-        generator = torch.Generator().manual_seed(self.seed)
-        trace = part(y[..., used], observed[..., used], generator=generator, keep=keep, project=False)
+        device = next(part.buffers()).device
+        numbers = range(len(y)) if self.numbers is None else self.numbers
+        draws = [seeded(self.seed, number) for number in numbers]
+        seen = (y[..., used].to(device), observed[..., used].to(device))
+        trace = part(*seen, generator=draws, keep=keep.to(device), project=False)
         assert trace.kept is not None
-        forecast = part.forecast(trace.kept, y.new_ones(1)).select(dofs[used])
-        return Answer(forecast.at(0), part.phase(trace.kept))
+        forecast = part.forecast(trace.kept, y.new_ones(1)).select(dofs[used].to(device)).at(0)
+        tensors = (value.cpu() if isinstance(value, Tensor) else value for value in forecast)
+        return Answer(Forecast(*tensors), part.phase(trace.kept).cpu())
 
 
 class MeanMethod:
     """The mean of the training set, whatever is seen."""
 
     def __init__(self, primitive: InteractionPrimitive) -> None:
-        self.ends = _ends(primitive)
+        self.ends = _ends(copy.deepcopy(primitive).cpu())
 
     def __call__(self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor) -> Answer:
         """See `Method`."""
@@ -92,7 +104,8 @@ class NearestMethod:
     """
 
     def __init__(self, primitive: InteractionPrimitive) -> None:
-        self.primitive, self.ends = primitive, _ends(primitive)
+        self.primitive = copy.deepcopy(primitive).cpu()
+        self.ends = _ends(self.primitive)
 
     def __call__(self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor) -> Answer:
         """See `Method`."""

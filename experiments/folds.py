@@ -16,8 +16,11 @@ from tqdm import tqdm
 
 from experiments.results import Cell, Values
 from experiments.run_folder import write_json
+from torch_ebip.ranks import Ranks
 
 Job = TypeVar("Job")
+LOST = "another process of this run ended; start it again with --out {} to go on, with any number of processes"
+"""What a process says that cannot go on alone."""
 
 
 def split(count: int, folds: int, fold: int, seed: int, test: float = 0.2) -> tuple[torch.Tensor, torch.Tensor]:
@@ -38,16 +41,32 @@ def share_cores(folds: int, workers: int | None) -> tuple[int, int]:
 
 
 def run_folds(
-    run: Callable[[Job], Values], jobs: Sequence[Job], workers: int, headline: Callable[[Values], str]
+    run: Callable[[Job], Values],
+    jobs: Sequence[Job],
+    workers: int,
+    headline: Callable[[Values], str],
+    ranks: Ranks | None = None,
 ) -> Values:
     """Folds in processes of their own; what is finished is kept if the run is interrupted.
+
+    Several ranks each do their share of the folds, one after the other.
 
     Args:
         run: one fold; a function of a module, so that a new process can import it.
         jobs: one a fold.
         workers: processes.
         headline: what the progress bar says of the values so far.
+        ranks: of a run of several processes that `torchrun` started.
     """
+    if ranks is not None and ranks.size > 1:
+        with tqdm(total=len(jobs), desc="folds", unit="fold", dynamic_ncols=True, disable=not ranks.first) as bar:
+            mine: list[Values] = []
+            for job in ranks.shard(jobs):
+                mine.append(run(job))
+                bar.set_postfix_str(headline(merge(mine)), refresh=False)
+                bar.update(min(ranks.size, len(jobs) - bar.n))
+        shares = ranks.gather(mine)
+        return merge([shares[i % ranks.size][i // ranks.size] for i in range(len(jobs))])
     parts: list[Values] = [{} for _ in jobs]
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context) as pool:
@@ -70,6 +89,19 @@ def merge(parts: Sequence[Values]) -> Values:
         cell: {name: np.concatenate([part[cell][name] for part in parts]) for name in methods}
         for cell, methods in parts[0].items()
     }
+
+
+def interleave(parts: Sequence[Values]) -> Values:
+    """Values of all interactions, of which the r-th part has every len(parts)-th from number r on."""
+    merged: Values = {}
+    for cell, methods in parts[0].items():
+        merged[cell] = {}
+        for name in methods:
+            whole = np.empty(sum(len(part[cell][name]) for part in parts))
+            for rank, part in enumerate(parts):
+                whole[rank :: len(parts)] = part[cell][name]
+            merged[cell][name] = whole
+    return merged
 
 
 def mean_of_cells(values: Values, method: str, metric: str) -> float:

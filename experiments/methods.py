@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
 from typing import NamedTuple
@@ -29,6 +29,7 @@ from torch_ebip.losses import ForwardKinematicsLoss
 from torch_ebip.monitor import Monitor
 from torch_ebip.noise import AboveOne
 from torch_ebip.objective import ForecastObjective, Weights
+from torch_ebip.ranks import Ranks
 from torch_ebip.tuning import Tuner, TuningResult, TuningSettings
 
 FACTORS = (1.0, 10.0, 100.0, 1000.0, 10000.0)
@@ -54,6 +55,7 @@ class Problem:
         targets: bool [D], DoFs to forecast.
         subsets: bool [D] of sensors by name.
         arm: with bool [D] of its joints, for the forward-kinematics term; None without one.
+        ranks: the processes that share the work on it.
     """
 
     demonstrations: Demonstrations
@@ -61,15 +63,18 @@ class Problem:
     targets: Tensor
     subsets: Mapping[str, Tensor]
     arm: tuple[RobotArm, Tensor] | None
+    ranks: Ranks = field(default_factory=Ranks)
 
     def objective(self) -> ForecastObjective:
         """CRPS and squared error of the targets, plus the tool's distance where there is an arm."""
+        targets = self.targets.to(self.primitive.weights.device)
         if self.arm is None:
-            return ForecastObjective(self.primitive, self.targets)
+            return ForecastObjective(self.primitive, targets)
         arm, joints = self.arm
+        joints = joints.to(targets.device)
         weights = Weights(tool=1.0)
         loss = ForwardKinematicsLoss(arm, rotation_weight=0.1)
-        return ForecastObjective(self.primitive, self.targets, weights=weights, arm=loss, arm_dofs=joints)
+        return ForecastObjective(self.primitive, targets, weights=weights, arm=loss, arm_dofs=joints)
 
 
 def scaled(primitive: InteractionPrimitive, factor: float, members: int | None = None) -> EnsembleFilter:
@@ -136,7 +141,8 @@ def best_factor(
     measure(factors)
     best = min(losses, key=lambda factor: losses[factor])
     measure([float(f"{best * 10**half:.4g}") for half in (-0.5, 0.5)])
-    write_json(record, losses)
+    if problem.ranks.first:
+        write_json(record, losses)
     return min(losses, key=lambda factor: losses[factor])
 
 
@@ -148,13 +154,16 @@ def best_start(problem: Problem, settings: TuningSettings, interactions: int, fa
     """
     if not record.exists():
         order = torch.randperm(len(problem.primitive), generator=torch.Generator().manual_seed(settings.seed + 1))
-        losses = []
+        losses: list[dict[str, float]] = []
         for half, sharpness in product((-1.0, -0.5, 0.0), SHARPNESSES):
             start = Start(float(f"{factor * 10**half:.4g}"), sharpness)
             loss = _tuner(problem, tunable(problem.primitive, start), settings).evaluate(order[:interactions])["loss"]
             losses.append({**start._asdict(), "loss": loss})
-        write_json(record, losses)
-    best = min(json.loads(record.read_text()), key=lambda entry: entry["loss"])
+        if problem.ranks.first:
+            write_json(record, losses)
+    else:
+        losses = json.loads(record.read_text())
+    best = min(losses, key=lambda entry: entry["loss"])
     return Start(best["factor"], best["sharpness"])
 
 
@@ -189,6 +198,7 @@ def _tuner(
         monitor,
         checkpoint,
         progress,
+        problem.ranks,
     )
 
 

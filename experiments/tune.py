@@ -3,6 +3,9 @@
 Methods: `ebip` is the paper's closed form, `ebip_scaled` the closed-form R times the best single factor,
 `ebip_tuned` the tuned filter; `mean` and `nearest` are what can be said without a filter. Without --data the
 recordings are the simulated ball catching.
+
+`torchrun --nproc-per-node K -m experiments.tune` shares the interactions of each step among K processes, or the
+folds if there are several; the result is the same.
 """
 
 from __future__ import annotations
@@ -11,6 +14,7 @@ import argparse
 import json
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -20,7 +24,16 @@ from tqdm import tqdm
 from experiments.data import FRACTIONS, load, thinning
 from experiments.evaluate import FilterMethod, MeanMethod, NearestMethod, evaluate
 from experiments.figures import forecast_figure, noise_figure, results_figure
-from experiments.folds import mean_of_cells, read_values, run_folds, share_cores, split, write_values
+from experiments.folds import (
+    LOST,
+    interleave,
+    mean_of_cells,
+    read_values,
+    run_folds,
+    share_cores,
+    split,
+    write_values,
+)
 from experiments.methods import FACTORS, Problem, best_factor, best_start, scaled, tunable, tune
 from experiments.results import Values, print_tables, summarise
 from experiments.run_folder import RunFolder, write_json
@@ -28,6 +41,7 @@ from torch_ebip import InteractionPrimitive, select_basis
 from torch_ebip.basis import rank_candidates, selection_table
 from torch_ebip.checkpoint import save_checkpoint
 from torch_ebip.monitor import Monitor
+from torch_ebip.ranks import RankLostError, Ranks
 from torch_ebip.tuning import TuningSettings
 
 
@@ -43,13 +57,20 @@ class Job:
     test: float
     scan: int
     threads: int
+    device: str
     folder: str
     tuning: TuningSettings
 
 
-def run_fold(job: Job, progress: Callable[[int, float, float], None] | None = None) -> Values:
-    """Fit, scan, tune and evaluate one fold; a finished one is read from its folder."""
+def run_fold(
+    job: Job, progress: Callable[[int, float, float], None] | None = None, ranks: Ranks | None = None
+) -> Values:
+    """Fit, scan, tune and evaluate one fold; a finished one is read from its folder.
+
+    Several ranks share the interactions of the fold; the first one writes and reports.
+    """
     torch.set_num_threads(job.threads)
+    ranks = Ranks(device=torch.device(job.device)) if ranks is None else ranks
     folder = Path(job.folder)
     finished = folder / "values.json"
     if finished.exists():
@@ -60,23 +81,31 @@ def run_fold(job: Job, progress: Callable[[int, float, float], None] | None = No
     known, tests = demonstrations.subset(training), demonstrations.subset(testing)
     ranking = rank_candidates(known)
     basis = select_basis(known, ranking=ranking)
-    primitive = InteractionPrimitive.fit(known, basis)
+    primitive = InteractionPrimitive.fit(known, basis).to(ranks.device)
     subsets = {name: layout.mask(names) for name, names in task.subsets.items()}
     arm = None if task.arm is None else (task.arm[0], layout.mask([task.arm[1]]))
-    problem = Problem(known, primitive, layout.mask(task.targets), subsets, arm)
-    with Monitor(folder / "tensorboard") as monitor:
-        config = {**asdict(job), "tuning": None, **asdict(job.tuning)}
-        monitor.text("configuration", "\n".join(f"- `{key}`: {value}" for key, value in config.items()))
-        choice = selection_table(ranking)
-        (folder / "basis.txt").write_text(f"{choice}\n")
-        monitor.text("basis", f"```\n{choice}\n```")
+    problem = Problem(known, primitive, layout.mask(task.targets), subsets, arm, ranks)
+    with Monitor(folder / "tensorboard") if ranks.first else nullcontext() as monitor:
+        if monitor is not None:
+            config = {**asdict(job), "tuning": None, **asdict(job.tuning)}
+            monitor.text("configuration", "\n".join(f"- `{key}`: {value}" for key, value in config.items()))
+            choice = selection_table(ranking)
+            (folder / "basis.txt").write_text(f"{choice}\n")
+            monitor.text("basis", f"```\n{choice}\n```")
         factor = best_factor(problem, scaled, job.tuning, job.scan, FACTORS, folder / "scan_scaled.json")
         start = best_start(problem, job.tuning, job.scan, factor, folder / "scan_tunable.json")
         tuned = tunable(primitive, start)
         result = tune(problem, tuned, job.tuning, monitor, folder / "checkpoint.pt", progress)
         filters = {"ebip": scaled(primitive, 1.0), "ebip_scaled": scaled(primitive, factor), "ebip_tuned": tuned}
         methods = {"mean": MeanMethod(primitive), "nearest": NearestMethod(primitive)}
-        answers = evaluate(task, methods | {name: FilterMethod(f, job.seed) for name, f in filters.items()}, tests)
+        mine = ranks.shard(range(len(tests)))
+        answering = {name: FilterMethod(f, job.seed, mine) for name, f in filters.items()}
+        shares = ranks.gather(evaluate(task, methods | answering, tests.subset(mine)))
+        answers = interleave(shares)
+        if monitor is None:
+            return answers
+        for filter in filters.values():
+            filter.cpu()
         sensors = layout.mask(next(reversed(task.subsets.values())))
         shown = [dof for name in task.targets for dof in layout[name].dofs[:3]]
         for step, name in ((0, "ebip"), (result.best_step, "ebip_tuned")):
@@ -85,7 +114,7 @@ def run_fold(job: Job, progress: Callable[[int, float, float], None] | None = No
         pair = {name: filters[name] for name in ("ebip", "ebip_tuned")}
         forecast_figure(pair, tests, 0, sensors, shown, FRACTIONS).savefig(folder / "forecasts.png", dpi=110)
         seen = [name for name in layout.names if not layout[name].controlled]
-        noise_figure(tuned, primitive.residual_variance, layout, seen).savefig(folder / "noise.png", dpi=110)
+        noise_figure(tuned, primitive.residual_variance.cpu(), layout, seen).savefig(folder / "noise.png", dpi=110)
         summary = summarise(answers, "ebip_tuned")["summary"]
         final = {
             f"final/{row['metric']}/{row['modality'] or 'all'}": row["mean"]
@@ -108,7 +137,7 @@ def run_fold(job: Job, progress: Callable[[int, float, float], None] | None = No
     save_checkpoint(
         folder / "filter.pt",
         {"start": start._asdict()},
-        {"parameters": {name: p.detach() for name, p in tuned.named_parameters()}},
+        {"parameters": {name: p.detach().cpu() for name, p in tuned.named_parameters()}},
     )
     write_values(finished, answers)
     return answers
@@ -118,11 +147,13 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the experiment from the command line."""
     options = _parser().parse_args(arguments)
     began = time.monotonic()
+    ranks = Ranks.start()
     tuning = TuningSettings(seed=options.seed, steps=options.steps)
     count, scan, test = options.demonstrations, 48, 0.2
     if options.quick:
         tuning = replace(tuning, steps=min(options.steps, 20), batch_size=8, validate_every=5)
         count, scan = min(count, 100), 12
+    ranks.from_first(lambda: load(options.data, count, options.seed) and None)  # simulated once, then kept
     demonstrations, task = load(options.data, count, options.seed)
     tuning = replace(tuning, thinning=thinning(demonstrations))
     settings = {
@@ -144,18 +175,27 @@ def main(arguments: list[str] | None = None) -> None:
             f"{len(demonstrations)} demonstrations with {held} held out are too few: tuning filters each of the "
             f"others by the rest in {tuning.folds} folds, and needs {2 * tuning.folds} of them"
         )
-    run = RunFolder("tune", settings, options.out, options.force)
+    run = ranks.from_first(lambda: RunFolder("tune", settings, options.out, options.force))
+    ranks.explain_on_termination(LOST.format(run.path))
     workers, threads = share_cores(options.folds, options.workers)
+    threads = threads if ranks.size == 1 else torch.get_num_threads()
     jobs = [
-        Job(fold, options.folds, options.data, count, options.seed, test, scan, threads,
+        Job(fold, options.folds, options.data, count, options.seed, test, scan, threads, str(ranks.device),
             str(run.path / f"fold-{fold:02d}" if options.folds > 1 else run.path), tuning)
         for fold in range(options.folds)
     ]  # fmt: skip
-    print(demonstrations)
+    if ranks.first:
+        print(demonstrations)
     try:
-        values = _single(jobs[0]) if len(jobs) == 1 else run_folds(run_fold, jobs, workers, _headline)
+        single = len(jobs) == 1
+        values = _single(jobs[0], ranks) if single else run_folds(run_fold, jobs, workers, _headline, ranks)
     except ValueError as error:
         raise SystemExit(f"{run.path}: {error}") from error
+    except RankLostError as error:
+        raise SystemExit(LOST.format(run.path)) from error
+    ranks.stop()
+    if not ranks.first:
+        return
     results = {
         "experiment": "tune",
         "dataset": {
@@ -182,14 +222,15 @@ def main(arguments: list[str] | None = None) -> None:
     print(f"watch it: tensorboard --logdir {run.path}")
 
 
-def _single(job: Job) -> Values:
-    with tqdm(total=job.tuning.steps, desc="tuning", unit="step", dynamic_ncols=True) as bar:
+def _single(job: Job, ranks: Ranks) -> Values:
+    silent = not ranks.first
+    with tqdm(total=job.tuning.steps, desc="tuning", unit="step", dynamic_ncols=True, disable=silent) as bar:
 
         def show(step: int, loss: float, validation: float) -> None:
             bar.set_postfix_str(f"train {loss:.3f}, validation {validation:.3f}", refresh=False)
             bar.update(step - bar.n)
 
-        return run_fold(job, show)
+        return run_fold(job, show, ranks)
 
 
 def _headline(values: Values) -> str:
