@@ -307,9 +307,9 @@ class LiveFilter:
         return (self.filter if all(chosen) else self.filter.restrict(dofs)), self._columns(dofs)
 
     def _state(self, columns: Tensor, entry: int | None = None) -> EnsembleState:
-        evidence = self._evidence
-        if evidence is not None and self._origin is not None:
-            evidence = evidence._replace(origin=self._origin[..., columns])
+        evidence, origin = self._evidence, self._origin
+        if evidence is not None and origin is not None:
             if entry is not None:
-                evidence = Evidence(*(part[entry] for part in evidence))
+                evidence, origin = Evidence(*(part[entry] for part in evidence)), origin[entry]
+            evidence = evidence._replace(origin=origin[..., columns])
         return EnsembleState(self._span.members(columns, entry), evidence)
