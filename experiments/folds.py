@@ -19,7 +19,7 @@ from experiments.run_folder import write_json
 from torch_ebip.ranks import Ranks
 
 Job = TypeVar("Job")
-LOST = "another process of this run ended; start it again with --out {} to go on, with any number of processes"
+LOST = "this run was ended, probably because one of its processes died; --out {} goes on, with any number of them"
 """What a process says that cannot go on alone."""
 
 

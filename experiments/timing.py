@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import random
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager
@@ -10,6 +11,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
+from threadpoolctl import threadpool_limits
 
 Key = TypeVar("Key", bound=Hashable)
 
@@ -35,9 +37,9 @@ def interleaved(
     before: Callable[[int], object] | None = None,
     warmup: int = 1,
 ) -> dict[Key, Timing]:
-    """Time actions in turn: a round is one call of each, in an order that rotates from round to round.
+    """Time actions in turn: a round is one call of each, in an order drawn anew (seeded) for each round.
 
-    An action finds caches as the one before it left them; by rotation each follows each.
+    An action finds caches as the one before it left them; so each follows each.
 
     Args:
         actions: by name.
@@ -50,14 +52,14 @@ def interleaved(
         A timing for each action.
     """
     every = {} if every is None else every
-    order = list(actions)
+    order, shuffle = list(actions), random.Random(0)
     taken: dict[Key, list[float]] = {key: [] for key in actions}
     with collected():
         for round_ in range(-warmup, repeats):
             if before is not None:
                 before(round_)
-            turn = round_ % len(order)
-            for key in order[turn:] + order[:turn]:
+            shuffle.shuffle(order)
+            for key in order:
                 if round_ % every.get(key, 1):
                     continue
                 began = time.perf_counter()
@@ -84,10 +86,11 @@ def collected() -> Iterator[None]:
 
 @contextmanager
 def threads(count: int) -> Iterator[None]:
-    """With some number of threads for torch's kernels."""
+    """With some number of threads for torch's kernels and numpy's libraries."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:
-        yield
+        with threadpool_limits(count):
+            yield
     finally:
         torch.set_num_threads(before)

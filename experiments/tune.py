@@ -192,7 +192,7 @@ def main(arguments: list[str] | None = None) -> None:
     except ValueError as error:
         raise SystemExit(f"{run.path}: {error}") from error
     except RankLostError as error:
-        raise SystemExit(LOST.format(run.path)) from error
+        raise SystemExit(f"{error}\n{LOST.format(run.path)}") from error
     ranks.stop()
     if not ranks.first:
         return
@@ -250,7 +250,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--steps", type=int, default=100, help="gradient steps at most (default: 100)")
     parser.add_argument("--seed", type=int, default=0, help="of data, splits and draws (default: 0)")
     parser.add_argument("--quick", action="store_true", help="a run of about a minute, to see that all works")
-    parser.add_argument("--workers", type=int, help="processes for folds (default: one a core)")
+    parser.add_argument("--workers", type=int, help="processes for folds without torchrun (default: one a core)")
     parser.add_argument(
         "--out", metavar="DIR", help="run folder (default: runs/tune/STAMP); resumes an unfinished run"
     )

@@ -60,10 +60,10 @@ def is_several(generator: Generators) -> bool:
 def seeded(*numbers: int) -> torch.Generator:
     """A generator of the CPU for some integers: neighbouring ones do not share streams."""
     seed = 17
-    for number in numbers:
+    for number in (*numbers, 0):  # once more, so that the last number is mixed like the others
         # The multiplier of Knuth's 64-bit linear congruential generator.
         seed = (seed * 6_364_136_223_846_793_005 + 1_442_695_040_888_963_407 + number) % 2**64
-    return torch.Generator().manual_seed(seed % 2**63)
+    return torch.Generator().manual_seed(seed >> 32)  # the better half; torch's generator takes no more
 
 
 def replayed(generator: Generators, states: Sequence[Tensor] | None = None) -> Generators:

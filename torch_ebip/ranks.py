@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable, Mapping, Sequence
+from datetime import timedelta
 from types import FrameType
 from typing import Any, TypeVar
 
@@ -48,12 +49,15 @@ class Ranks:
         if "TORCHELASTIC_RUN_ID" not in os.environ:
             return cls(0, 1, device)
         torch.set_num_threads(max(1, (os.cpu_count() or 1) // locals_))
-        dist.init_process_group("cpu:gloo,cuda:nccl" if gpus >= locals_ else "gloo")
+        if gpus:
+            torch.cuda.set_device(device)
+        # A process may wait for another's folds for long; that one has died is noticed by its closed connection.
+        dist.init_process_group("cpu:gloo,cuda:nccl" if gpus >= locals_ else "gloo", timeout=timedelta(days=7))
         return cls(dist.get_rank(), dist.get_world_size(), device)
 
     def stop(self) -> None:
         """Leave the group; call it when everything is done."""
-        if self.size > 1 or dist.is_initialized():
+        if dist.is_available() and dist.is_initialized():
             dist.destroy_process_group()
 
     @property
@@ -144,4 +148,4 @@ class Ranks:
         try:
             speak()
         except RuntimeError as error:
-            raise RankLostError("another process of this run ended") from error
+            raise RankLostError(f"no word from the other processes of this run ({error})") from error

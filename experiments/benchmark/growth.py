@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -28,27 +29,30 @@ def growth(rounds: int, seed: int) -> list[dict[str, Any]]:
     """
     found = []
     for name, sizes in SIZES.items():
-        versions: dict[int, Live] = {}
-        samples = {}
+        problems: dict[int, Any] = {}
         for size in sizes:
             now = {**BASE, name: size}
             problem = make_problem(now["weights"], now["members"], now["sensors"], torch.float32, seed=seed)
-            generator = torch.Generator().manual_seed(seed)
-            versions[size] = Live(problem, generator, now["batch"])
-            samples[size] = problem.y[:, problem.sensors]
-        position = {"t": 0}
+            problems[size] = problem, now["batch"], problem.y[:, problem.sensors]
+        state: dict[str, Any] = {"t": 0}
 
-        def before(round_: int, position: dict[str, int] = position) -> None:
-            """Next sample."""
-            position["t"] = round_ % 80
+        def before(round_: int, state: dict[str, Any] = state, problems: Any = problems) -> None:
+            """Next sample; a new interaction after the last."""
+            state["t"] = round_ % 80
+            if state["t"] == 0 or "versions" not in state:
+                state["versions"] = {
+                    size: Live(problem, torch.Generator().manual_seed(seed), batch)
+                    for size, (problem, batch, _) in problems.items()
+                }
+                for size, (_, _, y) in problems.items():
+                    state["versions"][size].step(y[0])
+
+        def action(size: int, state: dict[str, Any] = state, problems: Any = problems) -> Callable[[], object]:
+            """One step."""
+            return lambda: state["versions"][size].step(problems[size][2][state["t"]])
 
         with threads(1):
-            timings = interleaved(
-                {size: (lambda v=versions[size], y=samples[size], p=position: v.step(y[p["t"]])) for size in sizes},
-                rounds,
-                before=before,
-                warmup=20,
-            )
+            timings = interleaved({size: action(size) for size in sizes}, rounds, before=before, warmup=20)
         times = [timings[size].median for size in sizes]
         slope = float(np.polyfit(np.log(sizes), np.log(times), 1)[0])
         found.append(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import resource
 import time
 from pathlib import Path
 from typing import Any
@@ -102,9 +101,9 @@ def _gradient(sensors: int, segment: int | None, batch: int, samples: int, seed:
 
     with collected():
         run(2)
-        before = _resident()
+        before = _forget_peak()
         seconds = run(samples)
-    peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+    peak = _memory("VmHWM") - before
     return {
         "sensors": sensors,
         "segment": segment,
@@ -116,9 +115,16 @@ def _gradient(sensors: int, segment: int | None, batch: int, samples: int, seed:
     }
 
 
-def _resident() -> int:
-    """Bytes that this process holds now."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
+def _memory(name: str) -> int:
+    """Bytes that Linux reports of this process: VmRSS now, VmHWM at most."""
+    status = Path("/proc/self/status").read_text()
+    return 1024 * int(next(line.split()[1] for line in status.splitlines() if line.startswith(f"{name}:")))
+
+
+def _forget_peak() -> int:
+    """Let the peak begin anew, from what is held now: those bytes. (A new process inherits its parent's peak.)"""
+    Path("/proc/self/clear_refs").write_text("5")
+    return _memory("VmRSS")
 
 
 def _batch(problem: Problem, count: int, seed: int) -> torch.Tensor:

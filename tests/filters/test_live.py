@@ -1,5 +1,8 @@
 """The live path gives the numbers of the differentiable one, whatever it keeps and whatever it puts off."""
 
+import gc
+import weakref
+from collections import OrderedDict
 from typing import Any
 
 import pytest
@@ -8,7 +11,8 @@ from torch import Tensor
 
 from tests.conftest import interactions, small_primitive
 from torch_ebip import BSplineBasis, EnsembleFilter, GaussianBasis, InteractionPrimitive, StackedBasis, ebip
-from torch_ebip.filters import LiveFilter
+from torch_ebip.filters import ConstantVelocityPhase, LiveFilter
+from torch_ebip.filters.plan import PLANS, kept
 from torch_ebip.filters.span import SpanMembers
 
 HUMAN = torch.tensor([True, True, True, False, False])
@@ -171,6 +175,7 @@ def test_the_state_is_a_copy_and_leaves_the_demonstrations_alone() -> None:
         (torch.ones(5), None, r"DoFs \[3, 4\] are measured, but are none"),
         (torch.tensor([1, torch.inf, 1, 1, 1]), HUMAN, r"infinite where it is observed, in DoFs \[1\]"),
         (torch.ones(5), HUMAN.long(), "observed must be bool"),
+        (torch.ones(5, dtype=torch.float64), None, "y must be torch.float32 on cpu"),
     ],
 )
 def test_what_is_refused_in_a_sample(y: Tensor, observed: Tensor | None, message: str) -> None:
@@ -191,6 +196,54 @@ def test_what_is_refused_as_a_filter() -> None:
         LiveFilter(ebip(primitive), torch.zeros(5, dtype=torch.bool))
     with pytest.raises(ValueError, match="at most one batch dimension"):
         LiveFilter(ebip(primitive), batch_shape=(2, 3))
+
+
+def test_it_goes_when_nobody_holds_it() -> None:
+    """Without waiting for the cyclic garbage collector, which knows nothing of a GPU's memory."""
+    live = LiveFilter(ebip(small_primitive()), HUMAN)
+    live.update(torch.ones(5), HUMAN)
+    live.forecast(dofs=~HUMAN)
+    gone = weakref.ref(live)
+    gc.disable()
+    try:
+        del live
+        assert gone() is None
+    finally:
+        gc.enable()
+
+
+def test_only_so_many_plans_are_kept() -> None:
+    live = LiveFilter(ebip(small_primitive()))
+    for number in range(2, 32):
+        live.update(torch.ones(5), torch.tensor([bool(number >> bit & 1) for bit in range(5)]))
+    assert len(live._plans) == 30
+    store: OrderedDict[tuple[bool, ...], int] = OrderedDict()
+    for number in range(PLANS + 5):
+        kept(store, tuple(bool(number >> bit & 1) for bit in range(8)), lambda key: sum(key))
+    assert len(store) == PLANS
+
+
+def test_what_the_live_path_does_not_know_goes_the_other_way() -> None:
+    """Dynamics of one's own, and measurements of another dtype, with and without gradients."""
+
+    class Faster(ConstantVelocityPhase):
+        def forward(self, members: Tensor, dt: Tensor) -> Tensor:
+            return super().forward(members, 2 * dt)
+
+    y, observed = sequences()
+    filter = ebip(small_primitive(torch.float64))
+    filter.dynamics = Faster()
+    with_gradients = filter(y, observed, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        without = filter(y, observed, generator=torch.Generator().manual_seed(0))
+        filter(y.float(), observed)
+    torch.testing.assert_close(without.phase, with_gradients.phase)
+
+
+def test_generators_are_one_for_each_entry() -> None:
+    filter = ebip(small_primitive())
+    with pytest.raises(ValueError, match="24 generators"):
+        LiveFilter(filter, generator=[torch.Generator() for _ in range(24)])
 
 
 def test_a_covariance_that_cannot_be_factored_names_the_sensor() -> None:

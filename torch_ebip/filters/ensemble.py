@@ -10,7 +10,7 @@ from torch_ebip.draws import Generators, is_several, standard_normal
 from torch_ebip.filters.base import Trace
 from torch_ebip.filters.evidence import Evidence, EvidenceWeighting
 from torch_ebip.filters.in_place import filter_in_place
-from torch_ebip.filters.interaction import BasisProjection
+from torch_ebip.filters.interaction import BasisProjection, ConstantVelocityPhase
 from torch_ebip.filters.localisation import Localisation
 from torch_ebip.filters.members import EnsembleState, MemberFilter
 from torch_ebip.filters.priors import select_prior
@@ -190,11 +190,12 @@ class EnsembleFilter(MemberFilter):
         project: bool,
     ) -> Trace | None:
         """See `Filter._without_gradients`: in place, where updates are transforms of the members."""
-        one_interaction = isinstance(self.observation, BasisProjection) and isinstance(
-            self.noise.process, InteractionNoise
-        )
+        parts = (type(self.dynamics), type(self.observation), type(self.noise.process))
         if (
-            not one_interaction
+            parts != (ConstantVelocityPhase, BasisProjection, InteractionNoise)
+            or not hasattr(self.prior, "select")
+            or (state.evidence is None) != (self.weighting is None)
+            or y.dtype != state.members.dtype
             or self._leaves_span() is not None
             or isinstance(dt, Tensor)
             or y.ndim > 3

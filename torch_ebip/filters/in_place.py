@@ -35,7 +35,7 @@ def filter_in_place(
     dofs = None if project or not bool(ever.any()) else ever
     live = LiveFilter(filter, dofs, tuple(batch), generator=generator, state=state)
     some = observed.reshape(-1, length, filter.n_dofs).any(0)
-    ragged = (observed != some).flatten(-1).any(-1).reshape(-1, length).any(0).tolist()
+    ragged = (observed != some).any(-1).reshape(-1, length).any(0).tolist()
     phases, likelihoods, projections = [], [], []
     kept: list[tuple[tuple[int, ...], State]] = []
     for t, measured in enumerate(some.tolist()):

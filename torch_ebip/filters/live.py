@@ -11,8 +11,8 @@ It gives the same numbers as `EnsembleFilter.predict` and `EnsembleFilter.update
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import lru_cache
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -23,7 +23,7 @@ from torch_ebip.filters.evidence import Evidence
 from torch_ebip.filters.forecast import Forecast
 from torch_ebip.filters.interaction import BasisProjection, ConstantVelocityPhase
 from torch_ebip.filters.members import EnsembleState
-from torch_ebip.filters.plan import Plan
+from torch_ebip.filters.plan import Plan, kept, measured_dofs
 from torch_ebip.filters.span import SpanMembers
 from torch_ebip.functional.linear import FactorisationError, cholesky
 from torch_ebip.functional.moments import member_shares
@@ -31,9 +31,6 @@ from torch_ebip.noise.process import InteractionNoise
 
 if TYPE_CHECKING:
     from torch_ebip.filters.ensemble import EnsembleFilter
-
-PLANS = 64
-"""For how many sets of measured DoFs buffers are kept; the set not used for longest is dropped."""
 
 
 class LiveFilter:
@@ -71,6 +68,8 @@ class LiveFilter:
             raise ValueError(f"a live filter transforms members as wholes, but {reason}; use the filter itself")
         if len(batch_shape) > 1:
             raise ValueError(f"a live filter has at most one batch dimension, got {list(batch_shape)}")
+        if isinstance(generator, Sequence) and (not batch_shape or len(generator) != batch_shape[0]):
+            raise ValueError(f"{len(generator)} generators for a batch {list(batch_shape)}: needs one for each entry")
         dofs = torch.ones(filter.n_dofs, dtype=torch.bool) if dofs is None else dofs.cpu()
         if dofs.shape != (filter.n_dofs,) or dofs.dtype != torch.bool or not bool(dofs.any()):
             raise ValueError(f"dofs must be bool [{filter.n_dofs}], some True, got {dofs.dtype} {tuple(dofs.shape)}")
@@ -103,10 +102,10 @@ class LiveFilter:
         self._changing_noise = bool(getattr(filter.noise.measurement, "depends_on_phase", True))
         self._factor: tuple[float, Tensor] | None = None
         self._terms = start.new_empty(math.prod(batch_shape) * len(columns) * E)
-        self._plan = lru_cache(maxsize=PLANS)(self._make_plan)
+        self._plans: OrderedDict[tuple[bool, ...], Plan | None] = OrderedDict()
         self._add_product: Callable[..., Tensor] = Tensor.baddbmm_ if batch_shape else Tensor.addmm_
         self._plus_product: Callable[..., Tensor] = torch.baddbmm if batch_shape else torch.addmm
-        self._forecaster = lru_cache(maxsize=PLANS)(self._make_forecaster)
+        self._forecasters: OrderedDict[tuple[bool, ...], tuple[EnsembleFilter, Tensor]] = OrderedDict()
 
     @property
     def state(self) -> EnsembleState:
@@ -129,13 +128,13 @@ class LiveFilter:
         if dofs is not None and (dofs.shape != (self.filter.n_dofs,) or dofs.dtype != torch.bool):
             raise ValueError(f"dofs must be bool [{self.filter.n_dofs}], got {dofs.dtype} {list(dofs.shape)}")
         chosen = (True,) * self.filter.n_dofs if dofs is None else tuple(dofs.tolist())
-        part, columns = self._forecaster(chosen)
+        part, columns = kept(self._forecasters, chosen, self._make_forecaster)
         return part.forecast(self._state(columns), phase)
 
     @torch.no_grad()
     def project(self, dofs: tuple[bool, ...]) -> Tensor:
         """[..., D_chosen], mean of h(x) of some of the sensors' DoFs, a bool for each DoF of the filter."""
-        plan = self._plan(dofs)
+        plan = kept(self._plans, dofs, self._make_plan)
         assert plan is not None
         even = self._equal if self._evidence is None else self._evidence.weights.unsqueeze(-1)
         return (plan.project(self._phase) @ even).squeeze(-1)
@@ -169,10 +168,11 @@ class LiveFilter:
 
         Raises:
             ValueError: wrong shapes; infinity, or NaN where observed; a DoF that is none of the sensors'; an
-                innovation covariance that cannot be factored.
+                innovation covariance that cannot be factored. The state is then as before, but for the draws made.
         """
-        return self.take(y, *self._measured(y, observed))
+        return self.take(y, *measured_dofs(y, observed, self._members, self.batch_shape, self.filter.n_dofs))
 
+    @torch.no_grad()
     def take(self, y: Tensor, measured: tuple[bool, ...], mask: Tensor | None) -> Tensor:
         """`update` with arguments that were checked.
 
@@ -181,14 +181,14 @@ class LiveFilter:
             measured: D, which DoFs some entry of the batch measured.
             mask: bool [B, D], which of them each entry did; None if all did.
         """
-        plan = self._plan(measured)
+        plan = kept(self._plans, measured, self._make_plan)
         draws = None
         if is_several(self.generator) and not self.filter.square_root:
             # What one interaction draws may not depend on what others measure.
             E, D = self._members.shape[-1], self.filter.n_dofs
             draws = standard_normal((*self.batch_shape, E, D), self._members, self.generator)
         if plan is None:
-            return y.new_zeros(self.batch_shape)
+            return self._members.new_zeros(self.batch_shape)
         values = torch.index_select(y, -1, plan.dofs, out=plan.values).unsqueeze(-1)
         E = self._members.shape[-1]
         weights = None if self._evidence is None else self._evidence.weights.unsqueeze(-1)
@@ -226,7 +226,7 @@ class LiveFilter:
             torch.cholesky_solve(plan.right, factor, out=plan.solved)
             moves, shift = plan.moves, plan.shift
         likelihood = plan.log_likelihood(factor, residual, shift, seen)
-        if self._evidence is not None:
+        if self._evidence is not None and self._part.weighting is not None:
             here = torch.ones_like(values, dtype=torch.bool) if seen is None else seen
             self._learn(self._evidence, plan, values[..., 0], here[..., 0])
         self._move(weighted, moves, share, even, seen)
@@ -249,21 +249,6 @@ class LiveFilter:
             self._members.lerp_(mean, 1 - self._growth)
         else:
             self._members.lerp_(mean, (1 - self._growth) * seen.any(-2, keepdim=True).to(mean))
-
-    def _measured(self, y: Tensor, observed: Tensor | None) -> tuple[tuple[bool, ...], Tensor | None]:
-        """Which DoFs were measured by some entry of the batch, and by which if not by all."""
-        shape = (*self.batch_shape, self.filter.n_dofs)
-        if y.shape != shape:
-            raise ValueError(f"y must be {list(shape)}, one value for each DoF, got {list(y.shape)}")
-        if observed is None:
-            observed = y == y  # not where it is NaN
-        elif observed.dtype != torch.bool or observed.shape != shape:
-            raise ValueError(f"observed must be bool {list(shape)}, got {observed.dtype} {list(observed.shape)}")
-        if not self.batch_shape:
-            return tuple(observed.tolist()), None
-        some = observed.any(0)
-        mask = None if bool((observed == some).all()) else observed
-        return tuple(some.tolist()), mask
 
     def _deviations(self) -> tuple[Tensor, bool]:
         """Standard deviations of all sensors' DoFs now, and whether they change with phase."""

@@ -88,7 +88,7 @@ class MemberFilter(Filter):
         """g(x) + N(0, Q)."""
         moved: Tensor = self.dynamics(members, dt)
         process = self.noise.process
-        if isinstance(process, InteractionNoise) and isinstance(self.dynamics, ConstantVelocityPhase):
+        if isinstance(process, InteractionNoise) and type(self.dynamics) is ConstantVelocityPhase:
             return process.add_(moved, dt, generator)  # what this g returns is new: one copy less
         return process(moved, dt, generator)  # type: ignore[no-any-return]
 

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 
 from torch_ebip.basis.stacked import StackedBasis
 from torch_ebip.filters.span import SpanMembers
+
+Made = TypeVar("Made")
+PLANS = 64
+"""For how many sets of measured DoFs buffers are kept; the set not used for longest is dropped."""
 
 
 class _Range(NamedTuple):
@@ -125,6 +130,10 @@ class Plan:
             likelihood = torch.sub(self.constant, self.one, alpha=deviance)
         if not finite:
             infinite = ~self.values.isfinite() if seen is None else ~self.values.isfinite() & seen[..., 0]
+            if not bool(infinite.any()):
+                raise ValueError(
+                    "the likelihood of a sample is not finite: the members are not, or y is out of range"
+                )
             bad = self.dofs[infinite.reshape(-1, len(self.dofs)).any(0)].tolist()
             raise ValueError(f"y is NaN or infinite where it is observed, in DoFs {bad[:8]}; mark it False there")
         return likelihood
@@ -144,3 +153,39 @@ def _neighbours(basis: StackedBasis, rows: Sequence[int]) -> list[tuple[int, int
         if i == 0 or row != rows[i - 1] + 1 or basis.bases[row] != basis.bases[rows[i - 1]]
     ]
     return list(zip(starts, [*starts[1:], len(rows)], strict=True))
+
+
+def kept(
+    store: OrderedDict[tuple[bool, ...], Made], key: tuple[bool, ...], make: Callable[[tuple[bool, ...]], Made]
+) -> Made:
+    """What was made for a key before, or made now. (A cached method would keep its object alive.)"""
+    if key not in store:
+        store[key] = make(key)
+        if len(store) > PLANS:
+            store.popitem(last=False)
+    store.move_to_end(key)
+    return store[key]
+
+
+def measured_dofs(
+    y: Tensor, observed: Tensor | None, like: Tensor, batch_shape: tuple[int, ...], n_dofs: int
+) -> tuple[tuple[bool, ...], Tensor | None]:
+    """Which DoFs were measured by some entry of the batch; and by which, bool [B, D], if not by all.
+
+    Raises:
+        ValueError: wrong shapes, dtypes or devices.
+    """
+    shape = (*batch_shape, n_dofs)
+    if y.dtype != like.dtype or y.device != like.device:
+        raise ValueError(f"y must be {like.dtype} on {like.device}, as the filter is, got {y.dtype} on {y.device}")
+    if y.shape != shape:
+        raise ValueError(f"y must be {list(shape)}, one value for each DoF, got {list(y.shape)}")
+    if observed is None:
+        observed = y == y  # not where it is NaN
+    elif observed.dtype != torch.bool or observed.shape != shape:
+        raise ValueError(f"observed must be bool {list(shape)}, got {observed.dtype} {list(observed.shape)}")
+    if not batch_shape:
+        return tuple(observed.tolist()), None
+    some = observed.any(0)
+    mask = None if bool((observed == some).all()) else observed
+    return tuple(some.tolist()), mask
