@@ -67,8 +67,9 @@ def figure(results: Mapping[str, Any]) -> Figure:
     left.set_xlabel("time a step and interaction / floor")
     left.set_title("559 weights, 80 members, 10 sensors, float32, 1 thread", fontsize=10)
     for y, row in enumerate(rows):
-        left.text(row["over_floor"], y, f" {row['over_floor']:.3g}", va="center", fontsize=8)
-    left.margins(x=0.15)
+        ratio = row["over_floor"]
+        left.text(ratio, y, f" {ratio:.0f}" if ratio > 100 else f" {ratio:.3g}", va="center", fontsize=8)
+    left.margins(x=0.2)
     for row in results["growth"]:
         first = row["microseconds"][0]
         right.loglog(
