@@ -145,7 +145,7 @@ def test_only_the_named_parameters_are_tuned() -> None:
 
 def test_stops_early_when_validation_no_longer_improves() -> None:
     settings = TuningSettings(
-        steps=400, learning_rate=3.0, batch_size=4, folds=4, validate_every=1, patience=3, clip=1e3
+        steps=400, learning_rate=1.0, batch_size=4, folds=4, validate_every=1, patience=3, clip=1e3
     )
     _, tuner = filter_and_tuner(settings)
     result = tuner.run()
