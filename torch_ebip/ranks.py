@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from datetime import timedelta
 from types import FrameType
 from typing import Any, TypeVar
@@ -56,8 +57,10 @@ class Ranks:
         return cls(dist.get_rank(), dist.get_world_size(), device)
 
     def stop(self) -> None:
-        """Leave the group; call it when everything is done."""
+        """Leave the group, together; call it when everything is done."""
         if dist.is_available() and dist.is_initialized():
+            with suppress(RankLostError):  # what was to be said has been said
+                self._talk(dist.barrier)
             dist.destroy_process_group()
 
     @property
