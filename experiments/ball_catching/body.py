@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from experiments.ball_catching.geometry import GRAVITY, Array
 from experiments.ball_catching.motion import Motion
-from experiments.ball_catching.scene import GRAVITY, Array
 
 COORDINATES = (
     "pelvis_x",

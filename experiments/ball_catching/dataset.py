@@ -16,7 +16,7 @@ from platformdirs import user_cache_dir
 from experiments.ball_catching import flight as ballistics
 from experiments.ball_catching import sensors, teacher, thrower
 from experiments.ball_catching.flight import Flight
-from experiments.ball_catching.scene import RATE, Array
+from experiments.ball_catching.geometry import RATE, Array
 from experiments.ball_catching.sensors import LAYOUT
 from experiments.ball_catching.teacher import Lesson
 from experiments.ball_catching.thrower import STYLES, Throw
@@ -129,7 +129,7 @@ def load_or_generate(n: int = 221, seed: int = 0, cache_dir: str | os.PathLike[s
 def _digest() -> str:
     """Twelve hexadecimal digits of the source of everything the data depend on."""
     here = Path(__file__).parent
-    names = ("scene", "flight", "motion", "body", "thrower", "soles", "sensors", "teacher", "dataset")
+    names = ("geometry", "flight", "motion", "body", "thrower", "soles", "sensors", "teacher", "dataset")
     digest = hashlib.sha256()
     for name in names:
         digest.update((here / f"{name}.py").read_bytes())

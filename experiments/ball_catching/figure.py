@@ -7,7 +7,7 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from experiments.ball_catching.scene import BOX_WIDTH, DISTANCE, TABLE_HEIGHT, base_transform
+from experiments.ball_catching.geometry import BOX_WIDTH, DISTANCE, TABLE_HEIGHT, base_transform
 from experiments.ball_catching.sensors import LAYOUT
 from experiments.ball_catching.teacher import arm
 from torch_ebip import Demonstrations

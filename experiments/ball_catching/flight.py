@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from experiments.ball_catching.scene import GRAVITY, Array
+from experiments.ball_catching.geometry import GRAVITY, Array
 
 BALL_RADIUS = 0.045
 """m"""

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from experiments.ball_catching.scene import Array
+from experiments.ball_catching.geometry import Array
 
 
 class Motion(NamedTuple):

@@ -1,6 +1,6 @@
 """What the sensors read of one account of the throw: first exactly, then with noise, bias and dropouts.
 
-All at 60 Hz, synchronised. Positions in the world frame (`scene`), the inertial unit in its own frame (z
+All at 60 Hz, synchronised. Positions in the world frame (`geometry`), the inertial unit in its own frame (z
 along the forearm towards the elbow), head orientation as a rotation vector against "facing the robot", which
 stays well below pi.
 """
@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from experiments.ball_catching import soles
 from experiments.ball_catching.body import Body
+from experiments.ball_catching.geometry import GRAVITY, Array
 from experiments.ball_catching.motion import smoothstep
-from experiments.ball_catching.scene import GRAVITY, Array
 from experiments.ball_catching.thrower import Throw
 from torch_ebip import Layout, Modality
 

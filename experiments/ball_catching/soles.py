@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from experiments.ball_catching.body import FOOT_LENGTH, FOOT_WIDTH
+from experiments.ball_catching.geometry import Array
 from experiments.ball_catching.motion import Motion, smoothstep
-from experiments.ball_catching.scene import Array
 
 CELLS = (
     "heel_medial",

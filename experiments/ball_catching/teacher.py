@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from experiments.ball_catching import scene
+from experiments.ball_catching import geometry
 from experiments.ball_catching.flight import STEP, Flight
+from experiments.ball_catching.geometry import DISTANCE, Array
 from experiments.ball_catching.motion import Motion, Wobble, through
-from experiments.ball_catching.scene import DISTANCE, Array
 from torch_ebip.kinematics import RobotArm
 
 
@@ -71,8 +71,8 @@ def interception(flight: Flight, habit: np.ndarray, slack: Array) -> tuple[Array
 
 
 def arm() -> RobotArm:
-    """The UR5 with the box, float64; `scene.base_transform()` times its output is the box in the world."""
-    return RobotArm.ur5(scene.tool_transform()).double()
+    """The UR5 with the box, float64; `geometry.base_transform()` times its output is the box in the world."""
+    return RobotArm.ur5(geometry.tool_transform()).double()
 
 
 def solve(robot: RobotArm, box: Array, opening: Array, posture: Array, turn: Array) -> tuple[Array, Array]:
@@ -84,7 +84,7 @@ def solve(robot: RobotArm, box: Array, opening: Array, posture: Array, turn: Arr
     which keeps the solution in its branch. `turn` [N] is where the last joint, free otherwise, is liked, to
     0.2 rad.
     """
-    base = scene.base_transform()
+    base = geometry.base_transform()
     at, along = torch.from_numpy(box), torch.from_numpy(opening)
     liked = torch.from_numpy(np.concatenate([posture[:, :5], turn[:, None]], axis=-1))
     tolerance = torch.tensor([2.0, 2.0, 2.0, 2.0, 2.0, 0.2], dtype=torch.float64)

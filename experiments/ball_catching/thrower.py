@@ -15,8 +15,8 @@ import numpy as np
 
 from experiments.ball_catching import body, flight
 from experiments.ball_catching.body import COORDINATES, THROWING
+from experiments.ball_catching.geometry import DISTANCE, Array
 from experiments.ball_catching.motion import Motion, Wobble, through
-from experiments.ball_catching.scene import DISTANCE, Array
 
 
 @dataclass(frozen=True)

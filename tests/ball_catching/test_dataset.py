@@ -9,7 +9,7 @@ import torch
 from experiments.ball_catching import BOX_WIDTH, LAYOUT, SUBSETS, base_transform, dataset, generate, teacher
 from experiments.ball_catching.__main__ import main as command_line
 from experiments.ball_catching.dataset import Session, load_or_generate
-from experiments.ball_catching.scene import GRAVITY
+from experiments.ball_catching.geometry import GRAVITY
 from experiments.ball_catching.thrower import PEOPLE
 from torch_ebip import Demonstrations
 

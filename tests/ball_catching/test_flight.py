@@ -5,7 +5,7 @@ import numpy as np
 from experiments.ball_catching import flight
 from experiments.ball_catching.dataset import Session
 from experiments.ball_catching.flight import DRAG, STEP
-from experiments.ball_catching.scene import GRAVITY
+from experiments.ball_catching.geometry import GRAVITY
 from experiments.ball_catching.sensors import LAYOUT
 
 BALL = LAYOUT.slice("ball")

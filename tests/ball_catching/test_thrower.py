@@ -5,8 +5,8 @@ import pytest
 
 from experiments.ball_catching import body, sensors, soles
 from experiments.ball_catching.dataset import Session
+from experiments.ball_catching.geometry import GRAVITY
 from experiments.ball_catching.motion import Motion, Wobble, through
-from experiments.ball_catching.scene import GRAVITY
 from experiments.ball_catching.thrower import LOWER, UPPER, jacobian
 
 

@@ -1,4 +1,4 @@
-"""The scene: world frame, where the robot stands, and what it holds. Metres throughout.
+"""The set-up: world frame, where the robot stands, and what it holds. Metres throughout.
 
 World frame: origin on the floor under the thrower, x towards the robot, y to the thrower's left, z up.
 The UR5 stands on a table 3.7 m away. Its base frame (the manufacturer's Denavit-Hartenberg base, see
