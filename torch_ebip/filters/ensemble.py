@@ -190,19 +190,23 @@ class EnsembleFilter(MemberFilter):
         project: bool,
     ) -> Trace | None:
         """See `Filter._without_gradients`: in place, where updates are transforms of the members."""
-        parts = (type(self.dynamics), type(self.observation), type(self.noise.process))
         if (
-            parts != (ConstantVelocityPhase, BasisProjection, InteractionNoise)
-            or not hasattr(self.prior, "select")
+            not self.has_live_path
             or (state.evidence is None) != (self.weighting is None)
             or y.dtype != state.members.dtype
-            or self._leaves_span() is not None
             or isinstance(dt, Tensor)
             or y.ndim > 3
             or state.members.shape[:-2] != y.shape[:-2]
         ):
             return None
         return filter_in_place(self, y, observed, dt, state, generator, keep, project)
+
+    @property
+    def has_live_path(self) -> bool:
+        """Whether `LiveFilter` gives this filter's numbers: its model is known and its updates mix whole members."""
+        parts = (type(self.dynamics), type(self.observation), type(self.noise.process))
+        known = parts == (ConstantVelocityPhase, BasisProjection, InteractionNoise)
+        return known and hasattr(self.prior, "select") and self._leaves_span() is None
 
     def _leaves_span(self) -> str | None:
         return "covariances are localised" if self.localisation is not None else super()._leaves_span()

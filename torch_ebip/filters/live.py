@@ -13,12 +13,12 @@ from __future__ import annotations
 import math
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
-from torch_ebip.draws import Generators, is_several, standard_normal
+from torch_ebip.draws import Generators, is_several, set_states, standard_normal, states_of
 from torch_ebip.filters.evidence import Evidence
 from torch_ebip.filters.forecast import Forecast
 from torch_ebip.filters.interaction import BasisProjection, ConstantVelocityPhase
@@ -31,6 +31,14 @@ from torch_ebip.noise.process import InteractionNoise
 
 if TYPE_CHECKING:
     from torch_ebip.filters.ensemble import EnsembleFilter
+
+
+class LiveSnapshot(NamedTuple):
+    """What `LiveFilter.save` keeps: members, evidence (never changed in place), states of the generators."""
+
+    matrix: Tensor
+    evidence: Evidence | None
+    generators: list[Tensor]
 
 
 class LiveFilter:
@@ -121,6 +129,34 @@ class LiveFilter:
         """Mean phase [...]."""
         even = self._equal if self._evidence is None else self._evidence.weights.unsqueeze(-1)
         return (self._phase.unsqueeze(-2) @ even).squeeze((-1, -2))
+
+    @property
+    def phase_velocity(self) -> Tensor:
+        """Mean phase velocity [...], 1/s."""
+        even = self._equal if self._evidence is None else self._evidence.weights.unsqueeze(-1)
+        return (self._velocity.unsqueeze(-2) @ even).squeeze((-1, -2))
+
+    @property
+    def finite(self) -> bool:
+        """Whether the members are."""
+        return math.isfinite(float(self._members.sum()))
+
+    @torch.no_grad()
+    def save(self, into: LiveSnapshot | None = None) -> LiveSnapshot:
+        """Everything that `predict` and `update` change, the generators' states included, for `load`.
+
+        Args:
+            into: an older snapshot of this filter, whose memory is used again.
+        """
+        matrix = self._members.clone() if into is None else into.matrix.copy_(self._members)
+        return LiveSnapshot(matrix, self._evidence, states_of(self.generator))
+
+    @torch.no_grad()
+    def load(self, snapshot: LiveSnapshot) -> None:
+        """Go back to a snapshot of this filter: what follows gives the same numbers again, to the bit."""
+        self._members.copy_(snapshot.matrix)
+        self._evidence = snapshot.evidence
+        set_states(self.generator, snapshot.generators)
 
     @torch.no_grad()
     def forecast(self, phase: Tensor | None = None, dofs: Tensor | None = None) -> Forecast:

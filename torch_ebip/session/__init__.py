@@ -1,0 +1,7 @@
+"""One live interaction: asynchronous sensors in, forecasts out."""
+
+from torch_ebip.session.intake import SensorReport
+from torch_ebip.session.replaying import Replay, replay
+from torch_ebip.session.session import InteractionSession, SessionForecast
+
+__all__ = ["InteractionSession", "Replay", "SensorReport", "SessionForecast", "replay"]

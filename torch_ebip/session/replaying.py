@@ -1,0 +1,69 @@
+"""A recorded session, lived through again."""
+
+from __future__ import annotations
+
+import os
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_ebip.filters import Filter
+from torch_ebip.primitive import InteractionPrimitive
+from torch_ebip.session.log import read_log
+from torch_ebip.session.session import InteractionSession, SessionForecast, fingerprint
+
+
+class Replay(NamedTuple):
+    """A session as it was at the end of its recording.
+
+    Attributes:
+        session: to be asked further.
+        forecasts: all that were asked for, computed again.
+        recorded: their means as they were recorded, [P, D_c] each, in the dtype of the filter.
+    """
+
+    session: InteractionSession
+    forecasts: list[SessionForecast]
+    recorded: list[Tensor]
+
+    @property
+    def identical(self) -> bool:
+        """Whether every forecast is the recorded one to the bit."""
+        pairs = zip(self.forecasts, self.recorded, strict=True)
+        return all(torch.equal(again.mean.reshape(then.shape).cpu(), then) for again, then in pairs)
+
+
+def replay(path: str | os.PathLike[str], filter: Filter, primitive: InteractionPrimitive) -> Replay:
+    """Live through a recording again; on the same machine and software to the bit.
+
+    Args:
+        path: what `InteractionSession` wrote under ``record``.
+        filter, primitive: those of the session.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no recording, is damaged, or is one of another filter or primitive.
+    """
+    header, entries = read_log(path)
+    for name, module in (("filter", filter), ("primitive", primitive)):
+        if header.get(name) != fingerprint(module):
+            raise ValueError(f"{path}: recorded with another {name} than this one")
+    try:
+        settings = dict(header["settings"])
+        session = InteractionSession(filter, primitive, settings.pop("sensors"), **settings)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: the settings of the session are damaged: {error}") from error
+    forecasts, recorded = [], []
+    for entry in entries:
+        try:
+            if entry[0] == "push":
+                session.push(entry[1], entry[3], entry[2])
+            elif entry[0] == "advance":
+                session.advance(entry[1])
+            else:
+                forecasts.append(session.forecast(entry[2], entry[1]))
+                recorded.append(torch.tensor(entry[3], dtype=primitive.weights.dtype))
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{path}: damaged: {str(entry)[:80]}: {error}") from error
+    return Replay(session, forecasts, recorded)

@@ -1,0 +1,300 @@
+"""One live interaction: sensors push what they have when they have it, the robot asks what is to come.
+
+Time is cut into ticks as far apart as the demonstrations' samples. A filter takes in one tick after the other, each
+with the sample of every sensor that was taken nearest to it. A sample that arrives late belongs to a tick that is
+past: the filter is wound back to the tick before and takes in again what followed (fixed-lag replay), with the draws
+it had. So the state depends on what was measured and when, never on the order in which it arrived nor on when
+somebody asked.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import threading
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_ebip.filters import Filter
+from torch_ebip.primitive import InteractionPrimitive
+from torch_ebip.session.engine import make_engine
+from torch_ebip.session.intake import Freshness, Intake, SensorReport, as_number, as_vector, training_ranges
+from torch_ebip.session.log import SessionLog
+
+
+class SessionForecast(NamedTuple):
+    """What a session expects.
+
+    Attributes:
+        time: the present, s.
+        phase: where in the interaction it is now, 0 to 1.
+        time_to_end: seconds until phase 1; infinite if the interaction stands still.
+        dofs: names of the controlled DoFs, D_c of them.
+        mean, deviation: [D_c], or [P, D_c] for P horizons: expected values and their standard deviations.
+        stale: names of the sensors of which nothing was used for a while, or ever.
+    """
+
+    time: float
+    phase: float
+    time_to_end: float
+    dofs: tuple[str, ...]
+    mean: Tensor
+    deviation: Tensor
+    stale: tuple[str, ...]
+
+
+class InteractionSession:
+    """Filters one interaction as it happens. Bad sensor values never raise: they are refused and counted.
+
+    Its methods may be called from several threads; they wait for each other.
+
+    Args:
+        filter: of the primitive, tuned or not: any kind. As it is now; not changed.
+        primitive: whose layout names sensors and controlled DoFs, and whose demonstrations say what is plausible.
+        sensors: names of the modalities that will be pushed; default: all that are not controlled.
+        start: time of phase 0, s, on the clock of all other times.
+        window: seconds by which a sample may arrive late, or be ahead of the newest tick filtered; later ones are
+            dropped and counted.
+        margin: how far outside the range of the demonstrations a value may lie, in widths of that range.
+        frozen_after: seconds for which a sensor may repeat itself to the last digit before it is taken for frozen.
+        stale_after: seconds without anything usable after which a sensor is reported stale.
+        longest_gap: seconds of silence that `advance` bridges at most.
+        seed: of all draws.
+        record: file to write everything to that is pushed and asked, for `replay`; must not exist.
+
+    Raises:
+        ValueError: a sensor that the layout does not have or that is controlled; no controlled DoF; a setting that
+            is not positive; a filter of other DoFs.
+        FileExistsError, OSError: the recording cannot be written.
+    """
+
+    def __init__(
+        self,
+        filter: Filter,
+        primitive: InteractionPrimitive,
+        sensors: Sequence[str] | None = None,
+        *,
+        start: float = 0.0,
+        window: float = 0.25,
+        margin: float = 1.0,
+        frozen_after: float = 0.25,
+        stale_after: float = 0.1,
+        longest_gap: float = 10.0,
+        seed: int = 0,
+        record: str | os.PathLike[str] | None = None,
+    ) -> None:
+        layout = primitive.layout
+        if filter.n_dofs != layout.n_dofs:
+            raise ValueError(f"the filter has {filter.n_dofs} DoFs, the primitive's layout {layout.n_dofs}")
+        settings = {"window": window, "frozen_after": frozen_after, "stale_after": stale_after}
+        for name, value in {**settings, "longest_gap": longest_gap}.items():
+            if not value > 0:
+                raise ValueError(f"{name} must be a positive number of seconds, got {value}")
+        if not (math.isfinite(start) and margin >= 0):
+            raise ValueError(f"start must be finite and margin not negative, got {start} and {margin}")
+        if not bool(layout.controlled.any()):
+            raise ValueError(f"nothing to forecast: no modality of {', '.join(layout.names)} is controlled")
+        if sensors is None:
+            sensors = [modality.name for modality in layout.modalities if not modality.controlled]
+        for name in sensors:
+            if layout[name].controlled:
+                raise ValueError(f"{name!r} is controlled by the robot, not a sensor")
+        if not sensors:
+            raise ValueError("a session needs at least one sensor")
+        self.sensors, self.start, self.dt = tuple(sensors), float(start), filter.dt
+        self.dofs = tuple(dof for dof, ours in zip(layout.dofs, layout.controlled.tolist(), strict=True) if ours)
+        self._frozen_after, self._stale_after, self._longest_gap = frozen_after, stale_after, longest_gap
+        self._numbers = {name: i for i, name in enumerate(self.sensors)}
+        behind = max(1, math.ceil(window / self.dt))
+        self._intake = Intake(
+            [layout.slice(name) for name in self.sensors],
+            training_ranges(primitive, margin),
+            self.start,
+            self.dt,
+            behind,
+            behind + 1,
+        )
+        self._slots = behind + 2
+        self._engine = make_engine(filter, layout.mask(self.sensors), layout.controlled, self._slots, seed)
+        self._like = primitive.weights
+        self._freshness = [self._intake.fresh() for _ in range(self._slots)]
+        self._engine.save(-1 % self._slots)
+        self._head, self._dirty = -1, 0
+        self._now = self.start
+        self._failed = 0
+        self._lock = threading.RLock()
+        self._log: SessionLog | None = None
+        if record is not None:
+            header = {
+                "filter": fingerprint(filter),
+                "primitive": fingerprint(primitive),
+                "settings": {
+                    **settings,
+                    "sensors": list(self.sensors),
+                    "start": self.start,
+                    "margin": margin,
+                    "longest_gap": longest_gap,
+                    "seed": seed,
+                },
+            }
+            self._log = SessionLog(record, header)
+
+    def push(self, sensor: str, values: Any, time: Any) -> None:
+        """Take a sample of a sensor; costs microseconds, the filter does its work when it is asked.
+
+        Args:
+            sensor: name of a modality.
+            values: one number for each of its DoFs, in their units; NaN = not measured.
+            time: when it was taken, s.
+
+        Raises:
+            ValueError: no such sensor. Nothing else: see `report`.
+        """
+        number = self._numbers.get(sensor)
+        if number is None:
+            raise ValueError(f"no sensor {sensor!r}; this session has {', '.join(self.sensors)}")
+        with self._lock:
+            if self._log is not None:
+                columns = self._intake.columns[number]
+                vector = as_vector(values, columns.stop - columns.start)
+                self._log.write(["push", sensor, as_number(time), None if vector is None else vector.tolist()])
+            tick = self._intake.put(number, values, time, self._head)
+            if tick is not None:
+                self._dirty = min(self._dirty, tick)
+                self._now = max(self._now, self._intake.reports[number].last)
+
+    def advance(self, now: float | None = None) -> None:
+        """Filter up to the present.
+
+        Args:
+            now: the present, s; default: the newest time that was pushed or given. It never runs backwards.
+
+        Raises:
+            ValueError: it is not finite, or further ahead than ``longest_gap``.
+        """
+        with self._lock:
+            if self._log is not None:
+                self._log.write(["advance", now])
+            self._advance(now)
+
+    def forecast(self, horizon: float | Sequence[float] | None = None, now: float | None = None) -> SessionForecast:
+        """Filter up to the present, and say what the controlled DoFs should be.
+
+        Args:
+            horizon: seconds from now, one or several; default: the end of the interaction, phase 1. What lies
+                behind the end is the end.
+            now: see `advance`.
+
+        Raises:
+            ValueError: see `advance`; a horizon that is not finite.
+        """
+        with self._lock:
+            self._advance(now)
+            phase, velocity = self._engine.clock()
+            # Since the last tick the interaction went on.
+            phase += velocity * (self._now - (self.start + self._head * self.dt))
+            horizons = [] if horizon is None else [horizon] if isinstance(horizon, int | float) else list(horizon)
+            if not all(math.isfinite(h) for h in horizons):
+                raise ValueError(f"horizons must be finite numbers of seconds, got {horizons}")
+            phases = [min(max(phase + velocity * h, 0.0), 1.0) for h in horizons] if horizons else [1.0]
+            expected = self._engine.forecast(self._like.new_tensor(phases))
+            mean, deviation = expected.mean, expected.variance.sqrt()
+            if self._log is not None:
+                self._log.write(["forecast", now, horizon if horizon is None else horizons, mean.tolist()])
+            if not isinstance(horizon, Sequence):
+                mean, deviation = mean[0], deviation[0]
+            phase = min(max(phase, 0.0), 1.0)
+            left = (1 - phase) / velocity if velocity > 0 else math.inf
+            return SessionForecast(self._now, phase, left, self.dofs, mean, deviation, self._stale())
+
+    @property
+    def failed_updates(self) -> int:
+        """How many ticks were left out because the filter could not take them in."""
+        return self._failed
+
+    def report(self) -> dict[str, SensorReport]:
+        """What became of everything that was pushed, by sensor."""
+        with self._lock:
+            return dict(zip(self.sensors, self._intake.report(self._current()), strict=True))
+
+    def close(self) -> None:
+        """End the recording, if there is one."""
+        if self._log is not None:
+            self._log.close()
+
+    def __enter__(self) -> InteractionSession:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _current(self) -> Freshness:
+        return self._freshness[self._head % self._slots]
+
+    def _stale(self) -> tuple[str, ...]:
+        oldest = self._now - self._stale_after
+        used = self._current().used.tolist()
+        return tuple(
+            name
+            for name, tick in zip(self.sensors, used, strict=True)
+            if tick < 0 or self.start + tick * self.dt < oldest
+        )
+
+    def _advance(self, now: float | None) -> None:
+        if now is not None:
+            if not math.isfinite(now):
+                raise ValueError(f"now must be a finite time in seconds, got {now}")
+            gap = now - (self.start + max(self._head, 0) * self.dt)
+            if gap > self._longest_gap:
+                raise ValueError(
+                    f"now = {now} s is {gap:.1f} s after what was filtered last, more than the longest gap of "
+                    f"{self._longest_gap} s; begin a new session"
+                )
+            self._now = max(self._now, now)
+        # A time that should be a tick may be a rounding error short of it.
+        newest = math.floor((self._now - self.start) / self.dt + 1e-6)
+        if self._dirty <= self._head:
+            self._head = self._dirty - 1
+            self._engine.load(self._head % self._slots)
+        while self._head < newest:
+            self._step()
+        self._dirty = self._head + 1
+
+    def _step(self) -> None:
+        """One more tick."""
+        freshness = self._current().copy()
+        self._head += 1
+        if self._head > 0:
+            self._engine.predict()
+        values, usable = self._intake.usable(self._head, freshness, self._frozen_after)
+        if usable.any():
+            y = torch.as_tensor(values, dtype=self._like.dtype, device=self._like.device)
+            try:
+                self._engine.update(y, tuple(usable.tolist()))
+                done = self._engine.finite()
+            except ValueError:
+                done = False
+            if not done:
+                # Back to before the tick: this one is left out, as if nothing had been measured.
+                self._failed += 1
+                self._engine.load((self._head - 1) % self._slots)
+                if self._head > 0:
+                    self._engine.predict()
+        self._freshness[self._head % self._slots] = freshness
+        self._engine.save(self._head % self._slots)
+
+
+def fingerprint(module: torch.nn.Module) -> str:
+    """Sixteen hexadecimal digits that change with any parameter or buffer, or option that the module prints."""
+    digest = hashlib.sha256(repr(module).encode())
+    for name, tensor in sorted({**dict(module.named_parameters()), **dict(module.named_buffers())}.items()):
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]
