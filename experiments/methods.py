@@ -23,7 +23,7 @@ from torch_ebip import (
     ebip,
     particle_filter,
 )
-from torch_ebip.checkpoint import load_checkpoint
+from torch_ebip.checkpoint import load_checkpoint, save_checkpoint
 from torch_ebip.kinematics import RobotArm
 from torch_ebip.losses import ForwardKinematicsLoss
 from torch_ebip.monitor import Monitor
@@ -146,18 +146,26 @@ def best_factor(
     return min(losses, key=lambda factor: losses[factor])
 
 
-def best_start(problem: Problem, settings: TuningSettings, interactions: int, factor: float, record: Path) -> Start:
+def best_start(
+    problem: Problem,
+    settings: TuningSettings,
+    interactions: int,
+    factor: float,
+    record: Path,
+    members: int | None = None,
+) -> Start:
     """The start of `tunable` with the smallest loss, among half-decades of R up to a factor, and `SHARPNESSES`.
 
-    The factor is the best one without evidence weights, which take over a part of what a large R is for. Other
-    arguments: see `best_factor`.
+    The factor is the best one without evidence weights, which take over a part of what a large R is for. `members` is
+    the size of the filter's ensemble. Other arguments: see `best_factor`.
     """
     if not record.exists():
         order = torch.randperm(len(problem.primitive), generator=torch.Generator().manual_seed(settings.seed + 1))
         losses: list[dict[str, float]] = []
         for half, sharpness in product((-1.0, -0.5, 0.0), SHARPNESSES):
             start = Start(float(f"{factor * 10**half:.4g}"), sharpness)
-            loss = _tuner(problem, tunable(problem.primitive, start), settings).evaluate(order[:interactions])["loss"]
+            filter = tunable(problem.primitive, start, members)
+            loss = _tuner(problem, filter, settings).evaluate(order[:interactions])["loss"]
             losses.append({**start._asdict(), "loss": loss})
         if problem.ranks.first:
             write_json(record, losses)
@@ -202,18 +210,25 @@ def _tuner(
     )
 
 
-def restore(folder: Path, primitive: InteractionPrimitive) -> EnsembleFilter:
-    """The tuned filter that `experiments.tune` left in a run (or fold) folder.
+def keep(folder: Path, start: Start, tuned: EnsembleFilter) -> None:
+    """Leave a tuned filter in a folder, for `restore`."""
+    parameters = {name: p.detach().cpu() for name, p in tuned.named_parameters()}
+    save_checkpoint(folder / "filter.pt", {"start": start._asdict()}, {"parameters": parameters})
+
+
+def restore(folder: Path, primitive: InteractionPrimitive, members: int | None = None) -> EnsembleFilter:
+    """The tuned filter that an experiment left in a run (or fold) folder.
 
     Args:
         folder: with ``report.json`` and ``filter.pt``.
         primitive: of the demonstrations that it was tuned on.
+        members: size of its ensemble; default: all demonstrations.
 
     Raises:
         FileNotFoundError, ValueError: the files are not there, or not what a run writes.
     """
     start = Start(**json.loads((folder / "report.json").read_text())["start"])
     content = load_checkpoint(folder / "filter.pt", {"start": start._asdict()})
-    filter = tunable(primitive, start)
+    filter = tunable(primitive, start, members)
     filter.load_state_dict(content["parameters"], strict=False)
     return filter

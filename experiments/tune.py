@@ -34,12 +34,11 @@ from experiments.folds import (
     split,
     write_values,
 )
-from experiments.methods import FACTORS, Problem, best_factor, best_start, scaled, tunable, tune
+from experiments.methods import FACTORS, Problem, best_factor, best_start, keep, scaled, tunable, tune
 from experiments.results import Values, print_tables, summarise
 from experiments.run_folder import RunFolder, write_json
 from torch_ebip import InteractionPrimitive, select_basis
 from torch_ebip.basis import rank_candidates, selection_table
-from torch_ebip.checkpoint import save_checkpoint
 from torch_ebip.monitor import Monitor
 from torch_ebip.ranks import RankLostError, Ranks
 from torch_ebip.tuning import TuningSettings
@@ -134,11 +133,7 @@ def run_fold(
         "tuning_seconds": result.seconds,
     }
     write_json(folder / "report.json", report)
-    save_checkpoint(
-        folder / "filter.pt",
-        {"start": start._asdict()},
-        {"parameters": {name: p.detach().cpu() for name, p in tuned.named_parameters()}},
-    )
+    keep(folder, start, tuned)
     write_values(finished, answers)
     return answers
 

@@ -101,7 +101,7 @@ def head_turn(rng: np.random.Generator, throw: Throw, t: Array, eyes: Array, bal
     to_target = direction(np.broadcast_to(spot, eyes.shape))
     idle = np.stack([rng.normal(0.0, 0.08, n), rng.normal(0.25, 0.08, n)], axis=-1)[:, None]
     look = smoothstep((t - throw.look[:, None]) / 0.28)[..., None]
-    follow = smoothstep((t - throw.release[:, None] - onset) / 0.22)[..., None]
+    follow = smoothstep((t - throw.release[:, None] - onset) / 0.22)[..., None] * throw.sighted
     gain = throw.gaze[:, None, None] * np.array([1.0, 0.75])  # heads pitch less readily than they turn
     angles = (1 - look) * idle + look * (1 - follow) * gain * to_target + look * follow * gain * to_ball
     phase, speed = rng.uniform(0, 2 * np.pi, (2, n, 1)), rng.uniform(1.5, 5.0, (2, n, 1))

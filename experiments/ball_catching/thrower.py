@@ -122,7 +122,7 @@ FASTEST = np.array([0.8, 0.8, 0.8, 1.5, 0.8, 3.0, 3.0, 3.0, 3.0, 3.0, 2.5, 2.5, 
 class Throw:
     """N planned tosses; times in seconds since the toss began. `aim`: where the thrower wants the ball [N,
     3]; `look`: when the head turns to it [N]; `lift`, `land`: when the left foot leaves and meets the floor
-    (inf: it stays)."""
+    (inf: it stays); `sighted`: whether the eyes follow the ball."""
 
     person: np.ndarray
     style: np.ndarray
@@ -137,6 +137,7 @@ class Throw:
     coordinates: tuple[Array, Array, Array, Array]
     wobble: Wobble
     foot: tuple[Array, Array, Array]
+    sighted: bool = True
 
     def motion(self, t: Array) -> Motion:
         """Generalised coordinates [N, T, 13] at times [N, T]."""
@@ -175,8 +176,18 @@ def jacobian(posture: Array, stature: Array) -> Array:
     return np.stack(columns, axis=-1)
 
 
-def plan(rng: np.random.Generator, n: int) -> Throw:
-    """Draws people, styles and aims, and plans N tosses."""
+BLIND_AIM = np.array([0.10, 0.25, 0.12])
+"""m, standard deviations of what a blindfolded thrower takes for the robot's place, beyond the sighted one's aims."""
+BLIND_ERROR = np.array([0.15, 0.12, 0.12])
+"""m, of where the ball then goes, against what was intended."""
+
+
+def plan(rng: np.random.Generator, n: int, blindfolded: bool = False) -> Throw:
+    """Draws people, styles and aims, and plans N tosses.
+
+    Blindfolded, people remember roughly where the robot is, throw less accurately, look where they believe it to
+    be and do not follow the ball.
+    """
     who = rng.integers(len(PEOPLE), size=n)
     people = [PEOPLE[i] for i in who]
     kind = np.array([rng.choice(len(STYLES), p=person.styles) for person in people])
@@ -193,6 +204,8 @@ def plan(rng: np.random.Generator, n: int) -> Throw:
     # Where to: anywhere in the catchable region, which bends around the robot.
     aim_y = rng.uniform(-0.8, 0.8, n)
     aim = np.stack([DISTANCE - 0.52 * np.sqrt(1 - (aim_y / 1.15) ** 2), aim_y, rng.normal(1.0, 0.13, n)], axis=-1)
+    if blindfolded:
+        aim = aim + rng.normal(0.0, 1.0, (n, 3)) * BLIND_AIM
     bearing = np.arctan2(aim[:, 1], aim[:, 0])
 
     # When: idle, back swing, acceleration, follow-through, relaxing.
@@ -267,8 +280,9 @@ def plan(rng: np.random.Generator, n: int) -> Throw:
     still = Motion(q[:, 3:4], qd[:, 3:4], qdd[:, 3:4])
     hand = body.move(still, stature, mass).right_hand.p[:, 0]
     elevation = of_style("elevation") + of_person("loft") + rng.normal(0.0, 0.07, n)
-    seconds = flight.flight_time(hand, aim, elevation)
-    wanted = flight.release_velocity(hand, aim, seconds)
+    hit = aim + rng.normal(0.0, 1.0, (n, 3)) * BLIND_ERROR if blindfolded else aim
+    seconds = flight.flight_time(hand, hit, elevation)
+    wanted = flight.release_velocity(hand, hit, seconds)
     J = jacobian(q[:, 3], stature)
     share = of_style("share") * np.exp(rng.normal(0.0, 0.1, (n, 6)))
     weighted = share[:, :, None] * J.transpose(0, 2, 1)
@@ -318,4 +332,5 @@ def plan(rng: np.random.Generator, n: int) -> Throw:
         coordinates=(knots, q, qd, qdd),
         wobble=Wobble(rng, n, WOBBLE, FASTEST),
         foot=(left, right, stride),
+        sighted=not blindfolded,
     )

@@ -54,7 +54,8 @@ class StackedBasis(nn.Module):
     @property
     def bases(self) -> tuple[Basis, ...]:
         """The basis of each DoF, D of them."""
-        return tuple(self.unique[i] for i in self._basis_of_dof)  # type: ignore[misc]
+        unique = self.families
+        return tuple(unique[i] for i in self._basis_of_dof)
 
     @property
     def families(self) -> list[Basis]:

@@ -63,7 +63,7 @@ def replay(path: str | os.PathLike[str], filter: Filter, primitive: InteractionP
                 session.advance(entry[1])
             else:
                 forecasts.append(session.forecast(entry[2], entry[1]))
-                recorded.append(torch.tensor(entry[3], dtype=primitive.weights.dtype))
+                recorded.append(torch.tensor(entry[3], dtype=next(filter.parameters()).dtype))
         except (TypeError, ValueError) as error:
             raise ValueError(f"{path}: damaged: {str(entry)[:80]}: {error}") from error
     return Replay(session, forecasts, recorded)

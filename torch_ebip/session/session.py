@@ -60,6 +60,8 @@ class InteractionSession:
         start: time of phase 0, s, on the clock of all other times.
         window: seconds by which a sample may arrive late, or be ahead of the newest tick filtered; later ones are
             dropped and counted.
+        settle: seconds for which a tick waits for its samples before it is filtered. Sensors that arrive within it
+            cost no replay; forecasts go on from the last tick at the speed of the interaction.
         margin: how far outside the range of the demonstrations a value may lie, in widths of that range.
         frozen_after: seconds for which a sensor may repeat itself to the last digit before it is taken for frozen.
         stale_after: seconds without anything usable after which a sensor is reported stale.
@@ -81,6 +83,7 @@ class InteractionSession:
         *,
         start: float = 0.0,
         window: float = 0.25,
+        settle: float = 0.0,
         margin: float = 1.0,
         frozen_after: float = 0.25,
         stale_after: float = 0.1,
@@ -97,6 +100,8 @@ class InteractionSession:
                 raise ValueError(f"{name} must be a positive number of seconds, got {value}")
         if not (math.isfinite(start) and margin >= 0):
             raise ValueError(f"start must be finite and margin not negative, got {start} and {margin}")
+        if not 0 <= settle < window:
+            raise ValueError(f"settle must be at least 0 and less than the window of {window} s, got {settle}")
         if not bool(layout.controlled.any()):
             raise ValueError(f"nothing to forecast: no modality of {', '.join(layout.names)} is controlled")
         if sensors is None:
@@ -121,11 +126,11 @@ class InteractionSession:
         )
         self._slots = behind + 2
         self._engine = make_engine(filter, layout.mask(self.sensors), layout.controlled, self._slots, seed)
-        self._like = primitive.weights
+        self._like = next(filter.parameters())
         self._freshness = [self._intake.fresh() for _ in range(self._slots)]
         self._engine.save(-1 % self._slots)
         self._head, self._dirty = -1, 0
-        self._now = self.start
+        self._settle, self._now = settle, self.start
         self._failed = 0
         self._lock = threading.RLock()
         self._log: SessionLog | None = None
@@ -137,6 +142,7 @@ class InteractionSession:
                     **settings,
                     "sensors": list(self.sensors),
                     "start": self.start,
+                    "settle": settle,
                     "margin": margin,
                     "longest_gap": longest_gap,
                     "seed": seed,
@@ -197,7 +203,7 @@ class InteractionSession:
             self._advance(now)
             phase, velocity = self._engine.clock()
             # Since the last tick the interaction went on.
-            phase += velocity * (self._now - (self.start + self._head * self.dt))
+            phase += velocity * (self._now - (self.start + max(self._head, 0) * self.dt))
             horizons = [] if horizon is None else [horizon] if isinstance(horizon, int | float) else list(horizon)
             if not all(math.isfinite(h) for h in horizons):
                 raise ValueError(f"horizons must be finite numbers of seconds, got {horizons}")
@@ -259,7 +265,7 @@ class InteractionSession:
                 )
             self._now = max(self._now, now)
         # A time that should be a tick may be a rounding error short of it.
-        newest = math.floor((self._now - self.start) / self.dt + 1e-6)
+        newest = math.floor((self._now - self._settle - self.start) / self.dt + 1e-6)
         if self._dirty <= self._head:
             self._head = self._dirty - 1
             self._engine.load(self._head % self._slots)

@@ -30,8 +30,13 @@ BOX_MASS = 0.35
 """kg, of cardboard with a bracket."""
 WALL = 0.008
 """m, thickness of the box's walls."""
-CONTACT = {"solref": (0.006, 0.35), "friction": (0.6, 0.01, 0.003)}
-"""Of the ball with anything: a soft ball that jumps back with about a third of its speed, and does not roll far."""
+DAMPING = {"box": 1.0, "else": 0.35}
+"""Ratios of the contacts' damping. A soft ball jumps back from the box, which is lined, with about a seventh of its
+speed, from anything else with two fifths (a unilateral spring and damper lets go where their force is 0)."""
+CONTACT_TIME = 0.006
+"""s, time constant of a contact."""
+FRICTION = (0.6, 0.01, 0.003)
+"""Of the ball with anything: sliding, and its resistance to spinning (m) and rolling (m)."""
 
 
 class Link(NamedTuple):
@@ -59,7 +64,7 @@ LINKS = {
     "wrist_2_link": Link(1.219, (0.0, 0.01634, 0.09645), (((0, 0, 0.0), (0, 0, 0.095), 0.037),)),
     "wrist_3_link": Link(0.1879, (0.0, 0.0, 0.081141), (((0, 0, 0.03), (0, 0, 0.06), 0.035),)),
 }
-_ARM, _BOX, _BALL, _GROUND = (0.72, 0.76, 0.80, 1.0), (0.80, 0.62, 0.38, 1.0), (0.90, 0.25, 0.15, 1.0), 0.5
+_ARM, _BOX, _BALL = (0.72, 0.76, 0.80, 1.0), (0.80, 0.62, 0.38, 1.0), (0.90, 0.25, 0.15, 1.0)
 
 
 def load_mujoco() -> Any:
@@ -72,7 +77,10 @@ def load_mujoco() -> Any:
 
 
 def build() -> Any:
-    """The compiled scene, an `mjModel`. Bodies `box` and `ball`; site `box` is the tool of `tool_transform`."""
+    """The compiled scene, an `mjModel`: joints of the arm first, then the ball.
+
+    Bodies `ur5/box` and `ball`; the site `ur5/box` is the tool of `tool_transform`.
+    """
     mujoco = load_mujoco()
     spec = mujoco.MjSpec()
     spec.option.timestep = STEP
@@ -86,20 +94,19 @@ def build() -> Any:
     # A hollow ball: its own moment of inertia, two thirds of m r^2.
     ball.explicitinertial, ball.mass = True, BALL_MASS
     ball.inertia = np.full(3, 2 / 3 * BALL_MASS * BALL_RADIUS**2)
-    _collider(
-        ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(BALL_RADIUS, 0, 0), rgba=_BALL),
-        affine=True,
-    )
+    sphere = ball.add_geom(name="ball", type=mujoco.mjtGeom.mjGEOM_SPHERE, size=(BALL_RADIUS, 0, 0), rgba=_BALL)
+    sphere.contype, sphere.conaffinity = 0, 1
     return spec.compile()
 
 
-def _collider(geom: Any, affine: bool = False) -> Any:
-    """A geom that touches the ball only: of two geoms one must have the type that the other has an affinity to."""
-    geom.contype, geom.conaffinity = (0, 1) if affine else (1, 0)
-    geom.solref = CONTACT["solref"]
-    geom.friction = CONTACT["friction"]
-    geom.condim = 6
-    return geom
+def _collider(geom: Any, lined: bool = False) -> None:
+    """A geom that touches the ball only: of two geoms one must have the type that the other has an affinity to.
+
+    Of two geoms the one with the higher priority says how their contact is.
+    """
+    geom.contype, geom.conaffinity = 1, 0
+    geom.solref = (CONTACT_TIME, DAMPING["box" if lined else "else"])
+    geom.friction, geom.condim, geom.priority = FRICTION, 6, 1
 
 
 def _surroundings(mujoco: Any, spec: Any) -> None:
@@ -154,7 +161,7 @@ def _arm(mujoco: Any, spec: Any) -> None:
         # Each motor can give the effort of the URDF, which MuJoCo took over as the joint's range of force.
         motor = arm.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         motor.ctrllimited = mujoco.mjtLimited.mjLIMITED_FALSE
-    spec.attach(arm, frame=spec.worldbody.add_frame(pos=(DISTANCE, 0.0, TABLE_HEIGHT)), prefix="")
+    spec.attach(arm, frame=spec.worldbody.add_frame(pos=(DISTANCE, 0.0, TABLE_HEIGHT)), prefix="ur5/")
 
 
 def _box(mujoco: Any, flange: Any) -> None:
@@ -171,7 +178,7 @@ def _box(mujoco: Any, flange: Any) -> None:
     areas = np.array([8 * size[0] * size[1] * size[2] for size, _ in walls])
     for (size, pos), mass in zip(walls, BOX_MASS * areas / areas.sum(), strict=True):
         wall = flange.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, pos=pos, mass=mass, rgba=_BOX)
-        _collider(wall)
+        _collider(wall, lined=True)
     flange.add_site(name="box", pos=(0.0, 0.0, centre))
 
 

@@ -1,0 +1,156 @@
+"""Let the arm catch: a filter that forecasts against others, and against a catcher that only reacts.
+
+Throws under two conditions, aimed and blindfolded, in a MuJoCo scene with the UR5, its delays and limits. Filters
+work with ensembles of 80 demonstrations; `ebip_tuned` is tuned by gradient first, `ebip_tuned_all` is the same with
+all demonstrations, `ebip` the paper's closed form, `ebip_scaled` its R times the best factor, `mean` plays the mean
+demonstration, `reactive` sees the ball only, but knows its physics and the arm's kinematics.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from pathlib import Path
+
+from tqdm import tqdm
+
+from experiments.ball_catching.scene.model import load_mujoco
+from experiments.catch.controllers import LEAD
+from experiments.catch.jobs import METHODS, Plan, as_settings, run_all
+from experiments.catch.learning import learn
+from experiments.catch.table import markdown, print_table, summarise
+from experiments.catch.throws import LATENCY
+from experiments.run_folder import RunFolder, write_json
+from torch_ebip.files import atomic_write
+
+GROUPS = {"imu": ("imu_acceleration", "imu_gyro"), "shoes": ("shoe_left", "shoe_right")}
+"""Names of sensors that are one object, beside the single ones."""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the experiment from the command line."""
+    options = _parser().parse_args(arguments)
+    load_mujoco()
+    began = time.monotonic()
+    throws, demonstrations, steps = options.throws, options.demonstrations, options.steps
+    if options.quick:
+        throws, demonstrations, steps = min(throws, 6), min(demonstrations, 60), min(steps, 5)
+    if throws < 1 or demonstrations < 30 or not 0 < options.arm <= 1:
+        raise SystemExit("needs --throws of at least 1, --demonstrations of at least 30 and --arm between 0 and 1")
+    methods = _methods(options.methods)
+    sensors, share = _drop(options.drop)
+    lead = None if options.lead == "end" else float(options.lead)
+    plan = Plan("", throws, demonstrations, options.seed, lead, options.arm, sensors, share)
+    settings = {**as_settings(plan, methods), "steps": steps, "filter": options.filter}
+    run = RunFolder("catch", settings, options.out, options.force)
+    plan = Plan(str(run.path), throws, demonstrations, options.seed, lead, options.arm, sensors, share)
+    if options.filter is None:
+        with tqdm(total=steps, desc="tuning", unit="step", dynamic_ncols=True) as bar:
+
+            def show(step: int, loss: float, validation: float) -> None:
+                bar.set_postfix_str(f"train {loss:.3f}, validation {validation:.3f}", refresh=False)
+                bar.update(step - bar.n)
+
+            learn(run.path, demonstrations, options.seed, steps, show)
+    else:
+        _take_over(Path(options.filter), run.path)
+    results = run_all(plan, methods, options.workers or os.cpu_count() or 1)
+    summary = {
+        "experiment": "catch",
+        "dataset": {"source": "simulated ball catching", "demonstrations": demonstrations, "throws": throws},
+        **summarise(results, methods[0]),
+        "seconds": round(time.monotonic() - began, 1),
+    }
+    if not options.no_pictures:
+        from experiments.catch.pictures import draw_pictures
+
+        draw_pictures(plan, methods[0], results, run.path)
+    with atomic_write(run.path / "results.md") as file:
+        file.write(markdown(summary).encode())
+    summary["seconds"] = round(time.monotonic() - began, 1)
+    write_json(run.results, summary)
+    print_table(summary)
+    print(f"{summary['seconds']:.0f} s; written to {run.path}")
+
+
+def _methods(text: str) -> tuple[str, ...]:
+    names = tuple(dict.fromkeys(text.split(",")))
+    unknown = [name for name in names if name not in METHODS]
+    if unknown:
+        raise SystemExit(f"--methods: {', '.join(unknown)} unknown; there are {', '.join(METHODS)}")
+    return names
+
+
+def _drop(text: str | None) -> tuple[tuple[str, ...], float]:
+    """Names of the sensors to cut off, and the share of the throw from which on."""
+    if text is None:
+        return (), 0.0
+    name, _, when = text.partition("@")
+    try:
+        share = float(when)
+    except ValueError:
+        share = -1.0
+    sensors = GROUPS.get(name, (name,))
+    if not 0 <= share <= 1 or not set(sensors) <= set(LATENCY):
+        known = ", ".join([*GROUPS, *LATENCY])
+        raise SystemExit(f"--drop expects SENSOR@SHARE, a share between 0 and 1 and one of {known}; got {text!r}")
+    return sensors, share
+
+
+def _take_over(source: Path, target: Path) -> None:
+    """The tuned filter of another run."""
+    for name in ("filter.pt", "report.json"):
+        try:
+            content = (source / name).read_bytes()
+        except OSError as error:
+            raise SystemExit(
+                f"--filter {source}: holds no finished tuning of `experiments.catch` ({error})"
+            ) from error
+        with atomic_write(target / name) as file:
+            file.write(content)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m experiments.catch", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--throws", type=int, default=200, metavar="N", help="for each condition (default: 200)")
+    parser.add_argument(
+        "--methods",
+        default=",".join(METHODS),
+        metavar="A,B",
+        help=f"default: {','.join(METHODS)}; tests are against the first",
+    )
+    parser.add_argument(
+        "--drop", metavar="SENSOR@SHARE", help="a sensor that falls silent at that share of each throw, as in imu@0.3"
+    )
+    parser.add_argument(
+        "--arm",
+        type=float,
+        default=1.0,
+        metavar="SHARE",
+        help="an arm of that share of the UR5's speed and acceleration (default: 1)",
+    )
+    parser.add_argument(
+        "--lead",
+        default=str(LEAD),
+        metavar="S",
+        help=f"how far ahead, in seconds, the arm is led; 'end': to the expected end (default: {LEAD})",
+    )
+    parser.add_argument("--demonstrations", type=int, default=221, metavar="N", help="to learn from (default: 221)")
+    parser.add_argument("--steps", type=int, default=100, help="gradient steps at most (default: 100)")
+    parser.add_argument("--filter", metavar="RUN", help="take the tuned filter of another run of this experiment")
+    parser.add_argument("--seed", type=int, default=0, help="of demonstrations, throws and draws (default: 0)")
+    parser.add_argument("--quick", action="store_true", help="a run of a minute or two, to see that all works")
+    parser.add_argument("--no-pictures", action="store_true", help="neither the strip nor the animation")
+    parser.add_argument("--workers", type=int, help="processes (default: one a core)")
+    parser.add_argument(
+        "--out", metavar="DIR", help="run folder (default: runs/catch/STAMP); resumes an unfinished run"
+    )
+    parser.add_argument("--force", action="store_true", help="start over, also where --out holds a finished run")
+    return parser
+
+
+if __name__ == "__main__":
+    main()
