@@ -133,8 +133,8 @@ def legend(summary: Mapping[str, Any]) -> str:
     return (
         "caught: in the box a second after it touched it, Wilson 95 % interval; p: exact McNemar test against "
         f"{summary['reference']}, within reach; distance: of the ball from the box's centre at its closest, median "
-        "and quartiles; ahead of release: how long before it the box stayed within 20 cm of its final place, median and "
-        "quartiles; before release: share of throws with that before it; cycle: median and 99th percentile, "
+        "and quartiles; ahead of release: how long before it the box stayed within 20 cm of its final place, median "
+        "and quartiles; before release: share of throws with that before it; cycle: median and 99th percentile, "
         f"of {BUDGET:.1f} ms"
     )
 

@@ -24,7 +24,7 @@ class SensorReport:
         nan, infinite, out_of_range: samples with such a value; the values are refused, the rest of the sample is not.
         malformed: not a vector of as many numbers as the sensor has DoFs, or without a time.
         late: older than the window.
-        early: from before the interaction, or from further ahead than the window reaches.
+        early: from before the interaction, or too far ahead of it for any clock.
         frozen: ticks at which the sensor said the same for too long.
         last: time of the newest sample that was accepted, s; minus infinity if there is none.
     """

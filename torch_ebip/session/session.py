@@ -58,14 +58,13 @@ class InteractionSession:
         primitive: whose layout names sensors and controlled DoFs, and whose demonstrations say what is plausible.
         sensors: names of the modalities that will be pushed; default: all that are not controlled.
         start: time of phase 0, s, on the clock of all other times.
-        window: seconds by which a sample may arrive late, or be ahead of the newest tick filtered; later ones are
-            dropped and counted.
+        window: seconds by which a sample may arrive late; later ones are dropped and counted.
         settle: seconds for which a tick waits for its samples before it is filtered. Sensors that arrive within it
             cost no replay; forecasts go on from the last tick at the speed of the interaction.
         margin: how far outside the range of the demonstrations a value may lie, in widths of that range.
         frozen_after: seconds for which a sensor may repeat itself to the last digit before it is taken for frozen.
         stale_after: seconds without anything usable after which a sensor is reported stale.
-        longest_gap: seconds of silence that `advance` bridges at most.
+        longest_gap: seconds that the present, or a sample, may be ahead of what was filtered last.
         seed: of all draws.
         record: file to write everything to that is pushed and asked, for `replay`; must not exist.
 
@@ -122,7 +121,7 @@ class InteractionSession:
             self.start,
             self.dt,
             behind,
-            behind + 1,
+            math.ceil(longest_gap / self.dt),
         )
         self._slots = behind + 2
         self._engine = make_engine(filter, layout.mask(self.sensors), layout.controlled, self._slots, seed)
@@ -130,7 +129,7 @@ class InteractionSession:
         self._freshness = [self._intake.fresh() for _ in range(self._slots)]
         self._engine.save(-1 % self._slots)
         self._head, self._dirty = -1, 0
-        self._settle, self._now = settle, self.start
+        self._settle, self._now, self._newest = settle, self.start, self.start
         self._failed = 0
         self._lock = threading.RLock()
         self._log: SessionLog | None = None
@@ -172,13 +171,13 @@ class InteractionSession:
             tick = self._intake.put(number, values, time, self._head)
             if tick is not None:
                 self._dirty = min(self._dirty, tick)
-                self._now = max(self._now, self._intake.reports[number].last)
+                self._newest = max(self._newest, self._intake.reports[number].last)
 
     def advance(self, now: float | None = None) -> None:
         """Filter up to the present.
 
         Args:
-            now: the present, s; default: the newest time that was pushed or given. It never runs backwards.
+            now: the present, s; default: the newest time of any sample. It never runs backwards.
 
         Raises:
             ValueError: it is not finite, or further ahead than ``longest_gap``.
@@ -263,7 +262,7 @@ class InteractionSession:
                     f"now = {now} s is {gap:.1f} s after what was filtered last, more than the longest gap of "
                     f"{self._longest_gap} s; begin a new session"
                 )
-            self._now = max(self._now, now)
+        self._now = max(self._now, self._newest if now is None else now)
         # A time that should be a tick may be a rounding error short of it.
         newest = math.floor((self._now - self._settle - self.start) / self.dt + 1e-6)
         if self._dirty <= self._head:

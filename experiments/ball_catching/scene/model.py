@@ -64,7 +64,7 @@ LINKS = {
     "wrist_2_link": Link(1.219, (0.0, 0.01634, 0.09645), (((0, 0, 0.0), (0, 0, 0.095), 0.037),)),
     "wrist_3_link": Link(0.1879, (0.0, 0.0, 0.081141), (((0, 0, 0.03), (0, 0, 0.06), 0.035),)),
 }
-_ARM, _BOX, _BALL = (0.72, 0.76, 0.80, 1.0), (0.80, 0.62, 0.38, 1.0), (0.90, 0.25, 0.15, 1.0)
+_ARM, _BOX, _BALL = (0.72, 0.76, 0.80, 1.0), (0.80, 0.62, 0.38, 0.40), (0.90, 0.25, 0.15, 1.0)
 
 
 def load_mujoco() -> Any:
@@ -111,8 +111,9 @@ def _collider(geom: Any, lined: bool = False) -> None:
 
 def _surroundings(mujoco: Any, spec: Any) -> None:
     """Light, floor with a chequered pattern, and the table under the robot."""
-    spec.worldbody.add_light(pos=(1.5, -1.5, 4.0), dir=(0.1, 0.4, -1.0), diffuse=(0.7, 0.7, 0.7), castshadow=True)
-    spec.worldbody.add_light(pos=(1.5, 3.0, 3.0), dir=(0.1, -0.8, -1.0), diffuse=(0.3, 0.3, 0.3), castshadow=False)
+    spec.visual.headlight.ambient, spec.visual.headlight.diffuse = (0.45, 0.45, 0.45), (0.3, 0.3, 0.3)
+    sun = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    spec.worldbody.add_light(type=sun, pos=(1.5, -2.0, 5.0), dir=(0.2, 0.5, -1.0), diffuse=(0.5, 0.5, 0.5))
     spec.add_texture(
         name="sky",
         type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,

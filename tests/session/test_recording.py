@@ -1,0 +1,155 @@
+"""A recording replays to the bit; what is no recording, or is damaged, is refused and named."""
+
+from __future__ import annotations
+
+import errno
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from tests.session.test_session import filters, live, primitive, samples
+from torch_ebip import ebip
+from torch_ebip.session import InteractionSession, replay
+from torch_ebip.session.log import SessionLog
+
+
+def record(path: Path, name: str = "ebip with options") -> InteractionSession:
+    """An interaction with late, missing, broken and malformed samples, recorded."""
+    with live(name, seed=11, record=path) as session:
+        for k, (sensor, value, time) in enumerate(samples()):
+            session.push(sensor, value, time - (0.1 if k % 7 == 0 else 0.0))
+            if k % 5 == 0:
+                session.push(sensor, [math.nan, math.inf][: len(value)], time)
+                session.push(sensor, {"not": "numbers"}, time)
+                session.push(sensor, value, "yesterday")
+            if k % 3 == 0:
+                session.forecast([0.1, 0.3], time)
+            if k % 4 == 0:
+                session.advance(time)
+        session.forecast(0.1)
+        session.forecast()
+    return session
+
+
+@pytest.mark.parametrize("name", filters())
+def test_a_recording_replays_to_the_bit(name: str, tmp_path: Path) -> None:
+    session = record(tmp_path / "log.jsonl", name)
+    again = replay(tmp_path / "log.jsonl", filters()[name], primitive())
+    assert len(again.forecasts) > 15
+    assert again.identical
+    assert again.session.report() == session.report()
+    now, then = session.forecast([0.0, 0.2]), again.session.forecast([0.0, 0.2])
+    assert torch.equal(now.mean, then.mean)
+    assert torch.equal(now.deviation, then.deviation)
+
+
+def test_a_replay_that_differs_says_so(tmp_path: Path) -> None:
+    record(tmp_path / "log.jsonl")
+    lines = (tmp_path / "log.jsonl").read_text().splitlines(keepends=True)
+    entries = [json.loads(line) for line in lines[1:]]
+    at = next(i for i, entry in enumerate(entries) if entry[:2] == ["push", "hand"] and entry[2] > 0.2)
+    entries[at][3][0] += 1e-3
+    lines[1 + at] = json.dumps(entries[at]) + "\n"
+    (tmp_path / "other.jsonl").write_text("".join(lines))
+    assert not replay(tmp_path / "other.jsonl", filters()["ebip with options"], primitive()).identical
+
+
+def test_a_recording_belongs_to_its_filter(tmp_path: Path) -> None:
+    record(tmp_path / "log.jsonl", "ebip")
+    with pytest.raises(ValueError, match="recorded with another filter"):
+        replay(
+            tmp_path / "log.jsonl",
+            ebip(primitive(), residual_variance=2 * primitive().residual_variance),
+            primitive(),
+        )
+    with pytest.raises(ValueError, match="recorded with another primitive"):
+        replay(tmp_path / "log.jsonl", filters()["ebip"], primitive().subset(torch.arange(24).flip(0)))
+
+
+def test_nothing_is_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "log.jsonl").write_text("mine")
+    with pytest.raises(FileExistsError):
+        live(record=tmp_path / "log.jsonl")
+    assert (tmp_path / "log.jsonl").read_text() == "mine"
+
+
+def test_a_crash_loses_the_last_line_only(tmp_path: Path) -> None:
+    record(tmp_path / "log.jsonl")
+    whole = (tmp_path / "log.jsonl").read_bytes()
+    (tmp_path / "cut.jsonl").write_bytes(whole[:-10])
+    with pytest.warns(UserWarning, match="cut off"):
+        cut = replay(tmp_path / "cut.jsonl", filters()["ebip with options"], primitive())
+    assert cut.identical
+
+
+HEADER = '{"kind": "torch_ebip session", "format": 1}\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "not a recording"),
+        ("hello\n", "damaged"),
+        ('["push"]\n', "not a recording"),
+        ('{"kind": "torch_ebip session", "format": 7}\n', "format 7, this version reads 1"),
+        ("[" * 100_000 + "\n", "damaged"),
+        ("x" * (1 << 20) + "\n", "longer than any line"),
+        (HEADER, "another filter"),
+    ],
+)
+def test_what_is_no_recording_is_named(text: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "log.jsonl").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        replay(tmp_path / "log.jsonl", filters()["ebip"], primitive())
+
+
+@pytest.mark.parametrize(
+    "line",
+    ['["push", "nose", 0.1, [1.0]]', '["launch", 1]', '["push", "hand"]', '["advance", "soon"]', "{}", "[[1]]"],
+)
+def test_a_damaged_line_is_named(line: str, tmp_path: Path) -> None:
+    record(tmp_path / "log.jsonl")
+    lines = (tmp_path / "log.jsonl").read_text().splitlines()
+    lines[5] = line
+    (tmp_path / "log.jsonl").write_text("\n".join(lines) + "\n")
+    with pytest.raises(ValueError, match=r"log\.jsonl"):
+        replay(tmp_path / "log.jsonl", filters()["ebip with options"], primitive())
+
+
+def test_damaged_settings_are_named(tmp_path: Path) -> None:
+    record(tmp_path / "log.jsonl")
+    lines = (tmp_path / "log.jsonl").read_text().splitlines(keepends=True)
+    for settings in ({}, {"sensors": ["hand"], "window": "wide"}, {"sensors": ["hand"], "unknown": 1}, 3):
+        header: dict[str, Any] = {**json.loads(lines[0]), "settings": settings}
+        (tmp_path / "bad.jsonl").write_text(json.dumps(header) + "\n")
+        with pytest.raises(ValueError, match="settings of the session are damaged"):
+            replay(tmp_path / "bad.jsonl", filters()["ebip with options"], primitive())
+
+
+def test_a_full_disk_ends_the_recording_and_not_the_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    session = live(record=tmp_path / "log.jsonl")
+    stream = samples()
+    for sensor, value, time in stream[:20]:
+        session.push(sensor, value, time)
+    written = (tmp_path / "log.jsonl").read_text()
+
+    class Full:
+        def write(self, text: str) -> int:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        def close(self) -> None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    log = session._log
+    assert isinstance(log, SessionLog)
+    monkeypatch.setattr(log, "_file", Full())
+    with pytest.warns(UserWarning, match="recording ends here|last lines may be missing"):
+        session.push(*stream[20])
+    session.push(*stream[21])
+    assert bool(session.forecast(0.1).mean.isfinite().all())
+    assert not log.open
+    assert (tmp_path / "log.jsonl").read_text() == written

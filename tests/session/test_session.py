@@ -1,0 +1,363 @@
+"""One live interaction: its state depends on what was measured and when, and on nothing a sensor may do wrong."""
+
+from __future__ import annotations
+
+import gc
+import math
+import threading
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from tests.conftest import interactions, small_primitive
+from torch_ebip import BSplineBasis, Filter, InteractionPrimitive, bip, ebip, particle_filter
+from torch_ebip.draws import seeded
+from torch_ebip.filters.localisation import Localisation
+from torch_ebip.session import InteractionSession, SessionForecast
+
+DT = 1 / 30
+SENSORS = {"hand": slice(0, 2), "gaze": slice(2, 3)}
+Sample = tuple[str, tuple[float, ...], float]
+
+
+@cache
+def primitive() -> InteractionPrimitive:
+    return small_primitive()
+
+
+@cache
+def filters() -> dict[str, Filter]:
+    options: dict[str, Any] = {"square_root": True, "weigh": True, "inflation": 1.01, "context": BSplineBasis(4)}
+    return {
+        "ebip": ebip(primitive()),
+        "ebip with options": ebip(primitive(), 10, **options),
+        "localised": ebip(primitive(), localise=True),
+        "bip": bip(primitive()),
+        "particle filter": particle_filter(primitive()),
+    }
+
+
+def samples(length: int = 25, index: int = 1) -> list[Sample]:
+    """What the sensors measured in one interaction, in order; the gaze is blind for a while."""
+    values = interactions(3, seed=5)[index][:length]
+    stream = []
+    for k, row in enumerate(values.tolist()):
+        for name, columns in SENSORS.items():
+            if name == "hand" or not 8 <= k < 12:
+                stream.append((name, tuple(row[columns]), k * DT))
+    return stream
+
+
+def live(name: str = "ebip with options", **settings: Any) -> InteractionSession:
+    return InteractionSession(filters()[name], primitive(), **{"window": 0.3, "margin": 3.0, **settings})
+
+
+def everything(session: InteractionSession, now: float) -> list[Tensor]:
+    """Mean and deviation of forecasts that together depend on the whole state."""
+    told = session.forecast([0.0, 0.1, 0.5, 2.0], now)
+    return [told.mean, told.deviation, torch.tensor([told.phase, told.time_to_end])]
+
+
+def same(one: list[Tensor], other: list[Tensor]) -> bool:
+    return all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+@pytest.mark.parametrize("name", filters())
+def test_a_stream_in_order_is_the_filter(name: str) -> None:
+    """Against the filter's own steps, written out."""
+    session, filter, generator = live(name, seed=3), filters()[name], seeded(3)
+    stream = samples()
+    values = torch.full((25, 5), torch.nan)
+    for sensor, value, time in stream:
+        values[round(time / DT), SENSORS[sensor]] = torch.tensor(value)
+        session.push(sensor, value, time)
+    with torch.no_grad():
+        state = filter.initial_state(generator=generator)
+        for k, y in enumerate(values):
+            if k:
+                state = filter.predict(state, filter.dt, generator)
+            state, _ = filter.update(state, y, generator=generator)
+        velocity = float(state.mean[1])
+        phase = float(filter.phase(state))
+        wanted = filter.forecast(state, torch.tensor([phase + 0.2 * velocity])).at(0)
+    told = session.forecast(0.2, 24 * DT)
+    assert told.phase == pytest.approx(min(max(phase, 0), 1), abs=1e-4)
+    assert told.time_to_end == pytest.approx((1 - told.phase) / velocity, rel=1e-3, abs=1e-3)
+    # Rounding only: some filters leave out here what no sensor sees, or work in place.
+    torch.testing.assert_close(told.mean, wanted.mean[3:], rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(told.deviation, wanted.variance[3:].sqrt(), rtol=2e-2, atol=1e-3)
+    assert told.dofs == ("arm.1", "arm.2")
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    delays=st.lists(st.floats(0.0, 0.25), min_size=46, max_size=46),
+    polls=st.lists(st.booleans(), min_size=46, max_size=46),
+    settle=st.sampled_from([0.0, 0.05]),
+    name=st.sampled_from(["ebip", "ebip with options", "particle filter"]),
+)
+def test_any_order_within_the_window_gives_the_same_state(
+    delays: list[float], polls: list[bool], settle: float, name: str
+) -> None:
+    stream = samples()
+    ordered = live(name, settle=settle)
+    for sensor, value, time in stream:
+        ordered.push(sensor, value, time)
+        ordered.advance(time)
+    shuffled = live(name, settle=settle)
+    arrivals = sorted(zip((time + d for (_, _, time), d in zip(stream, delays, strict=True)), stream, strict=True))
+    for (arrival, (sensor, value, time)), poll in zip(arrivals, polls, strict=True):
+        shuffled.push(sensor, value, time)
+        if poll:
+            shuffled.forecast(0.1, arrival)
+    assert all(report.late == 0 for report in shuffled.report().values())
+    end = 24 * DT + 0.3
+    assert same(everything(ordered, end), everything(shuffled, end))
+
+
+number = st.one_of(
+    st.floats(allow_nan=True, allow_infinity=True), st.sampled_from([1e308, -1e308, 1e-320, 1e12]), st.integers()
+)
+value = st.one_of(
+    st.lists(number, max_size=4),
+    st.none(),
+    st.text(max_size=3),
+    number,
+    st.lists(st.text(max_size=2), min_size=1, max_size=2),
+    st.dictionaries(st.text(max_size=1), number, max_size=2),
+)
+moment = st.one_of(st.floats(-0.1, 1.2), number, st.none(), st.text(max_size=2))
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    garbage=st.lists(st.tuples(st.sampled_from(["hand", "gaze"]), value, moment), max_size=40),
+    name=st.sampled_from(["ebip", "ebip with options", "bip", "particle filter"]),
+    margin=st.sampled_from([1.0, 1e30]),
+)
+def test_garbage_never_raises_and_never_makes_the_state_infinite(
+    garbage: list[tuple[str, Any, Any]], name: str, margin: float
+) -> None:
+    """With an endless margin whatever is finite reaches the filter itself."""
+    session = live(name, margin=margin)
+    stream = samples()
+    for k in range(max(len(stream), len(garbage))):
+        if k < len(garbage):
+            session.push(*garbage[k])
+        if k < len(stream):
+            session.push(*stream[k])
+            told = session.forecast(0.1, stream[k][2])
+            assert bool(told.mean.isfinite().all() & told.deviation.isfinite().all())
+            assert 0 <= told.phase <= 1
+    assert session._engine.finite()
+
+
+@pytest.mark.parametrize("name", filters())
+def test_an_update_that_fails_is_left_out(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    session, other = live(name), live(name)
+    update = session._engine.update
+
+    def refuse(y: Tensor, measured: tuple[bool, ...]) -> None:
+        update(y, measured)
+        if 0.39 < session._now < 0.41:
+            raise ValueError("cannot be factored")
+
+    monkeypatch.setattr(session._engine, "update", refuse)
+    for sensor, value, time in samples():
+        session.push(sensor, value, time)
+        session.advance(time)
+        if not 0.39 < time < 0.41:
+            other.push(sensor, value, time)
+        other.advance(time)
+    assert session.failed_updates == 2  # for the hand alone, and again with the gaze
+    assert other.failed_updates == 0
+    assert same(everything(session, 1.0), everything(other, 1.0))
+
+
+def test_what_was_refused_is_counted() -> None:
+    session = live(margin=0.5)
+    stream = samples()
+    for sensor, value, time in stream:
+        session.push(sensor, value, time)
+    session.advance(24 * DT)
+    good = session.report()["hand"].accepted
+    session.push("hand", (math.nan, 0.1), 24 * DT)
+    session.push("hand", (math.inf, math.nan), 24 * DT)
+    session.push("hand", (1e3, 0.1), 24 * DT)
+    session.push("hand", (0.1,), 24 * DT)
+    session.push("hand", "broken", 24 * DT)
+    session.push("hand", (0.1, 0.1), math.nan)
+    session.push("hand", (0.1, 0.1), 0.0)
+    session.push("hand", (0.1, 0.1), -1.0)
+    session.push("hand", (0.1, 0.1), 1e9)
+    report = session.report()["hand"]
+    assert (report.nan, report.infinite, report.out_of_range, report.malformed) == (2, 1, 1, 3)
+    assert (report.late, report.early, report.accepted - good) == (1, 2, 2)
+    with pytest.raises(ValueError, match="no sensor 'nose'; this session has hand, gaze"):
+        session.push("nose", (1.0,), 0.0)
+
+
+def test_part_of_a_sample_is_used_where_the_rest_cannot_be() -> None:
+    partial, alone = live(), live()
+    for sensor, value, time in samples():
+        if sensor == "hand":
+            partial.push(sensor, (value[0], math.inf), time)
+            alone.push(sensor, (value[0], math.nan), time)
+    assert same(everything(partial, 0.8), everything(alone, 0.8))
+
+
+def test_a_frozen_sensor_is_refused_and_reported_stale() -> None:
+    frozen, silent = live(frozen_after=0.1), live()
+    for sensor, value, time in samples():
+        broken = sensor == "hand" and time > 0.3
+        frozen.push(sensor, (0.123, 0.5) if broken else value, time)
+        # Until it is found out it is believed: four ticks within a tenth of a second.
+        if not broken:
+            silent.push(sensor, value, time)
+        elif time < 0.3 + 4.5 * DT:
+            silent.push(sensor, (0.123, 0.5), time)
+    one, other = frozen.forecast(now=24 * DT), silent.forecast(now=24 * DT)
+    assert torch.equal(one.mean, other.mean)
+    assert one.stale == ("hand",)
+    assert frozen.report()["hand"].frozen == 25 - 10 - 4
+    assert silent.report()["hand"].frozen == 0
+
+
+def test_sensors_that_say_nothing_are_stale() -> None:
+    session = live(stale_after=0.1)
+    assert session.forecast(now=0.0).stale == ("hand", "gaze")
+    for sensor, value, time in samples():
+        if sensor == "hand" or time < 0.2:
+            session.push(sensor, value, time)
+    assert session.forecast(now=0.2).stale == ()
+    assert session.forecast(now=0.5).stale == ("gaze",)
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 2, 0)])
+def test_of_a_faster_sensor_the_nearest_sample_counts(order: tuple[int, ...]) -> None:
+    stream = samples()
+    exact, fast = live(), live()
+    for sensor, value, time in stream:
+        exact.push(sensor, value, time)
+        pushes = [(time, value), (time + 0.3 * DT, value[::-1]), (time - 0.2 * DT, tuple(0.5 * v for v in value))]
+        for i in order:
+            if pushes[i][0] >= -0.5 * DT:
+                fast.push(sensor, pushes[i][1], pushes[i][0])
+    assert same(everything(exact, 0.8), everything(fast, 0.8))
+
+
+def test_forecasts_do_not_change_what_comes_after() -> None:
+    quiet, asked = live(), live()
+    for sensor, value, time in samples():
+        quiet.push(sensor, value, time)
+        asked.push(sensor, value, time)
+        for horizon in (None, 0.1, [0.1, 0.2]):
+            asked.forecast(horizon, time)
+    assert same(everything(quiet, 0.8), everything(asked, 0.8))
+
+
+def test_time_goes_on_between_and_after_samples() -> None:
+    session = live()
+    for sensor, value, time in samples():
+        session.push(sensor, value, time)
+    told = [session.forecast(now=0.5 + 0.25 * k * DT) for k in range(8)]
+    phases = np.array([one.phase for one in told])
+    assert (np.diff(phases) > 0).all()
+    left = np.array([one.time_to_end for one in told])
+    # A tick's new samples may move the phase a little; between ticks it is exactly the speed.
+    np.testing.assert_allclose(np.diff(left)[:3], -0.25 * DT, atol=1e-6)
+    assert session.forecast(now=0.4).time == told[-1].time  # never backwards
+    assert session.forecast(100.0).mean.equal(session.forecast().mean)  # behind the end is the end
+
+
+def test_several_threads_may_push() -> None:
+    stream = samples()
+    ordered, threaded = live(), live()
+    for sensor, value, time in stream:
+        ordered.push(sensor, value, time)
+
+    def feed(name: str) -> None:
+        for sensor, value, time in stream:
+            if sensor == name:
+                threaded.push(sensor, value, time)
+
+    threads = [threading.Thread(target=feed, args=(name,)) for name in SENSORS]
+    for thread in threads:
+        thread.start()
+    for _ in range(20):
+        threaded.forecast(0.1)
+    for thread in threads:
+        thread.join()
+    assert sum(report.late for report in threaded.report().values()) == 0
+    assert same(everything(ordered, 0.8), everything(threaded, 0.8))
+
+
+def test_memory_does_not_grow() -> None:
+    session = live(longest_gap=1.0)
+
+    def on(first: int, last: int) -> None:
+        generator = np.random.default_rng(first)
+        for k in range(first, last):
+            session.push("hand", generator.normal(0.0, 0.1, 2), k * DT)
+            session.push("gaze", generator.normal(0.0, 0.1, 1), (k - 3) * DT)  # late: replays each time
+            session.forecast(0.1, k * DT)
+
+    def alive() -> tuple[int, int]:
+        """Objects, and numbers in tensors and arrays. (Allocations would count Python's own lists of free tuples.)"""
+        gc.collect()
+        objects = gc.get_objects()
+        tensors = sum(part.numel() for part in objects if type(part) is Tensor)
+        return len(objects), tensors
+
+    on(0, 100)
+    before = alive()
+    on(100, 600)
+    after = alive()
+    assert after[0] - before[0] < 50
+    assert after[1] == before[1]
+    assert len(session._intake._ring) < 60
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: live(sensors=["arm"]), "'arm' is controlled by the robot"),
+        (lambda: live(sensors=["nose"]), "no modality 'nose'"),
+        (lambda: live(sensors=[]), "at least one sensor"),
+        (lambda: live(window=0.0), "window must be a positive"),
+        (lambda: live(settle=0.4), "settle must be"),
+        (lambda: live(margin=-1.0), "margin not negative"),
+        (lambda: live(start=math.inf), "start must be finite"),
+        (lambda: live().forecast(math.nan), "horizons must be finite"),
+        (lambda: live().forecast(now=math.nan), "now must be a finite"),
+        (lambda: live().advance(1e6), "more than the longest gap"),
+    ],
+)
+def test_mistakes_of_the_caller_are_explained(make: Callable[[], Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_double_precision_and_another_clock() -> None:
+    double = small_primitive(torch.float64)
+    session = InteractionSession(ebip(double), double, start=1e5, margin=3.0)
+    other = InteractionSession(ebip(double), double, margin=3.0)
+    for sensor, value, time in samples():
+        session.push(sensor, value, 1e5 + time)
+        other.push(sensor, value, time)
+    told: SessionForecast = session.forecast(0.1, 1e5 + 0.8)
+    assert told.mean.dtype == torch.float64
+    torch.testing.assert_close(told.mean, other.forecast(0.1, 0.8).mean, rtol=1e-6, atol=1e-6)
+
+
+def test_a_localised_filter_has_no_live_path() -> None:
+    localised = filters()["localised"]
+    assert isinstance(getattr(localised, "localisation", None), Localisation)
+    assert not localised.has_live_path  # type: ignore[attr-defined]
