@@ -40,7 +40,7 @@ def main(arguments: list[str] | None = None) -> None:
         raise SystemExit("needs --throws of at least 1, --demonstrations of at least 30 and --arm between 0 and 1")
     methods = _methods(options.methods)
     sensors, share = _drop(options.drop)
-    lead = None if options.lead == "end" else float(options.lead)
+    lead = _lead(options.lead)
     plan = Plan("", throws, demonstrations, options.seed, lead, options.arm, sensors, share)
     settings = {**as_settings(plan, methods), "steps": steps, "filter": options.filter}
     run = RunFolder("catch", settings, options.out, options.force)
@@ -96,6 +96,13 @@ def _drop(text: str | None) -> tuple[tuple[str, ...], float]:
         known = ", ".join([*GROUPS, *LATENCY])
         raise SystemExit(f"--drop expects SENSOR@SHARE, a share between 0 and 1 and one of {known}; got {text!r}")
     return sensors, share
+
+
+def _lead(text: str) -> float | None:
+    try:
+        return None if text == "end" else float(text)
+    except ValueError as error:
+        raise SystemExit(f"--lead expects seconds or 'end', got {text!r}") from error
 
 
 def _take_over(source: Path, target: Path) -> None:

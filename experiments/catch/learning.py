@@ -25,7 +25,12 @@ def know(demonstrations: int, seed: int) -> InteractionPrimitive:
 
 
 def learn(
-    folder: Path, demonstrations: int, seed: int, steps: int, progress: Callable[[int, float, float], None] | None
+    folder: Path,
+    demonstrations: int,
+    seed: int,
+    steps: int,
+    progress: Callable[[int, float, float], None] | None,
+    scan: int = 48,
 ) -> None:
     """Tune a filter of 80 members for all sensors together, on all demonstrations; what is finished is kept.
 
@@ -35,6 +40,7 @@ def learn(
         seed: of data and draws.
         steps: gradient steps at most.
         progress: called with step, loss and validation.
+        scan: interactions that decide where tuning starts.
     """
     if (folder / "filter.pt").exists():
         return
@@ -49,8 +55,8 @@ def learn(
     def build(primitive: InteractionPrimitive, factor: float) -> Filter:
         return scaled(primitive, factor, MEMBERS)
 
-    factor = best_factor(problem, build, settings, 48, FACTORS, folder / "scan_scaled.json")
-    start = best_start(problem, settings, 48, factor, folder / "scan_tunable.json", MEMBERS)
+    factor = best_factor(problem, build, settings, scan, FACTORS, folder / "scan_scaled.json")
+    start = best_start(problem, settings, scan, factor, folder / "scan_tunable.json", MEMBERS)
     tuned = tunable(primitive, start, MEMBERS)
     with Monitor(folder / "tensorboard") as monitor:
         result = tune(problem, tuned, settings, monitor, folder / "checkpoint.pt", progress)
