@@ -82,8 +82,8 @@ HEADS = (
     "condition",
     "method",
     "caught",
-    "caught within reach",
     "p",
+    "caught within reach",
     "distance [m]",
     "ahead of release [s]",
     "before release",
@@ -96,9 +96,7 @@ def lines(summary: Mapping[str, Any]) -> list[tuple[str, ...]]:
     found: dict[tuple[str, str], dict[str, Any]] = {}
     for row in summary["rows"]:
         found.setdefault((row["condition"], row["method"]), {})[row["metric"]] = row
-    p_values = {
-        (c["condition"], c["b"]): c["p_value"] for c in summary["comparisons"] if c["metric"] == "caught_within_reach"
-    }
+    p_values = {(c["condition"], c["b"]): c["p_value"] for c in summary["comparisons"] if c["metric"] == "caught"}
     made = []
     for (condition, method), metrics in found.items():
         p = p_values.get((condition, method))
@@ -111,8 +109,8 @@ def lines(summary: Mapping[str, Any]) -> list[tuple[str, ...]]:
                 condition,
                 method,
                 _rate(metrics.get("caught")),
-                _rate(metrics.get("caught_within_reach")),
                 "" if p is None else f"{p:.2g}",
+                _rate(metrics.get("caught_within_reach")),
                 f"{distance['value']:.3f} ({distance['low']:.3f} to {distance['high']:.3f})",
                 f"{ahead['value']:+.2f} ({ahead['low']:+.2f} to {ahead['high']:+.2f})",
                 f"{metrics['settled_before_release']['value']:.0%}",
@@ -131,11 +129,11 @@ def _rate(row: Mapping[str, Any] | None) -> str:
 def legend(summary: Mapping[str, Any]) -> str:
     """What the columns mean."""
     return (
-        "caught: in the box a second after it touched it, Wilson 95 % interval; p: exact McNemar test against "
-        f"{summary['reference']}, within reach; distance: of the ball from the box's centre at its closest, median "
-        "and quartiles; ahead of release: how long before it the box stayed within 20 cm of its final place, median "
-        "and quartiles; before release: share of throws with that before it; cycle: median and 99th percentile, "
-        f"of {BUDGET:.1f} ms"
+        "caught: in the box a second after it touched it, with Wilson's 95 % interval; p: exact McNemar test against "
+        f"{summary['reference']}; within reach: an arm that sets out at the release can get there; distance: of the "
+        "ball from the box's centre at its closest, median and quartiles; ahead of release: how long before it the "
+        "box stayed within 20 cm of its final place, median and quartiles; before release: share of throws in which "
+        f"that was before it; cycle: median and 99th percentile, of {BUDGET:.1f} ms"
     )
 
 
