@@ -263,6 +263,18 @@ def test_forecasts_do_not_change_what_comes_after() -> None:
     assert same(everything(quiet, 0.8), everything(asked, 0.8))
 
 
+def test_numbers_of_any_library_are_numbers() -> None:
+    session = live()
+    for sensor, value, time in samples():
+        session.push(sensor, torch.tensor(value), np.float32(time))
+    one = session.forecast(np.float32(0.125), np.float64(0.75))
+    many = session.forecast(np.array([0.125]), 0.75)
+    assert one.mean.shape == (2,)
+    assert many.mean.shape == (1, 2)
+    assert torch.equal(one.mean, many.mean[0])
+    assert torch.equal(one.mean, session.forecast(torch.tensor(0.125), torch.tensor(0.75)).mean)
+
+
 def test_time_goes_on_between_and_after_samples() -> None:
     session = live()
     for sensor, value, time in samples():

@@ -221,7 +221,7 @@ class Intake:
 def as_vector(values: Any, length: int) -> Array | None:
     """Numbers [length] of whatever a sensor sent; None if it is not that."""
     try:
-        vector = np.array(values, dtype=np.float64)
+        vector = np.asarray(values, dtype=np.float64)
     except Exception:  # an object may raise anything when it is asked for numbers
         return None
     return vector if vector.shape == (length,) else None

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from types import TracebackType
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -184,7 +185,7 @@ class InteractionSession:
         """
         with self._lock:
             if self._log is not None:
-                self._log.write(["advance", now])
+                self._log.write(["advance", _plain(now)])
             self._advance(now)
 
     def forecast(self, horizon: float | Sequence[float] | None = None, now: float | None = None) -> SessionForecast:
@@ -198,20 +199,22 @@ class InteractionSession:
         Raises:
             ValueError: see `advance`; a horizon that is not finite.
         """
+        several = horizon is not None and np.ndim(horizon) > 0
+        horizons = [] if horizon is None else np.atleast_1d(np.asarray(horizon, dtype=np.float64)).tolist()
+        if not all(math.isfinite(h) for h in horizons):
+            raise ValueError(f"horizons must be finite numbers of seconds, got {horizons}")
         with self._lock:
             self._advance(now)
             phase, velocity = self._engine.clock()
             # Since the last tick the interaction went on.
             phase += velocity * (self._now - (self.start + max(self._head, 0) * self.dt))
-            horizons = [] if horizon is None else [horizon] if isinstance(horizon, int | float) else list(horizon)
-            if not all(math.isfinite(h) for h in horizons):
-                raise ValueError(f"horizons must be finite numbers of seconds, got {horizons}")
-            phases = [min(max(phase + velocity * h, 0.0), 1.0) for h in horizons] if horizons else [1.0]
+            phases = [1.0] if horizon is None else [min(max(phase + velocity * h, 0.0), 1.0) for h in horizons]
             expected = self._engine.forecast(self._like.new_tensor(phases))
             mean, deviation = expected.mean, expected.variance.sqrt()
             if self._log is not None:
-                self._log.write(["forecast", now, horizon if horizon is None else horizons, mean.tolist()])
-            if not isinstance(horizon, Sequence):
+                asked = horizons if several else horizons[0] if horizons else None
+                self._log.write(["forecast", _plain(now), asked, mean.tolist()])
+            if not several:
                 mean, deviation = mean[0], deviation[0]
             phase = min(max(phase, 0.0), 1.0)
             left = (1 - phase) / velocity if velocity > 0 else math.inf
@@ -294,6 +297,11 @@ class InteractionSession:
                     self._engine.predict()
         self._freshness[self._head % self._slots] = freshness
         self._engine.save(self._head % self._slots)
+
+
+def _plain(time: float | None) -> float | None:
+    """A number that JSON knows, whatever library it is from."""
+    return None if time is None else float(time)
 
 
 def fingerprint(module: torch.nn.Module) -> str:
