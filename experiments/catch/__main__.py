@@ -9,6 +9,8 @@ demonstration, `reactive` sees the ball only, but knows its physics and the arm'
 from __future__ import annotations
 
 import argparse
+import json
+import math
 import os
 import time
 from pathlib import Path
@@ -43,6 +45,7 @@ def main(arguments: list[str] | None = None) -> None:
     lead = _lead(options.lead)
     plan = Plan("", throws, demonstrations, options.seed, lead, options.arm, sensors, share)
     settings = {**as_settings(plan, methods), "steps": steps, "filter": options.filter}
+    taken = {} if options.filter is None else _take(Path(options.filter), plan)
     run = RunFolder("catch", settings, options.out, options.force)
     plan = Plan(str(run.path), throws, demonstrations, options.seed, lead, options.arm, sensors, share)
     if options.filter is None:
@@ -53,14 +56,14 @@ def main(arguments: list[str] | None = None) -> None:
                 bar.update(step - bar.n)
 
             learn(run.path, demonstrations, options.seed, steps, show)
-    else:
-        _take_over(Path(options.filter), run.path)
+    for name, content in taken.items():
+        with atomic_write(run.path / name) as file:
+            file.write(content)
     results = run_all(plan, methods, options.workers or os.cpu_count() or 1)
     summary = {
         "experiment": "catch",
         "dataset": {"source": "simulated ball catching", "demonstrations": demonstrations, "throws": throws},
         **summarise(results, methods[0]),
-        "seconds": round(time.monotonic() - began, 1),
     }
     if not options.no_pictures:
         from experiments.catch.pictures import draw_pictures
@@ -100,22 +103,28 @@ def _drop(text: str | None) -> tuple[tuple[str, ...], float]:
 
 def _lead(text: str) -> float | None:
     try:
-        return None if text == "end" else float(text)
-    except ValueError as error:
-        raise SystemExit(f"--lead expects seconds or 'end', got {text!r}") from error
+        seconds = None if text == "end" else float(text)
+    except ValueError:
+        seconds = math.nan
+    if seconds is not None and not 0 <= seconds < math.inf:
+        raise SystemExit(f"--lead expects seconds or 'end', got {text!r}")
+    return seconds
 
 
-def _take_over(source: Path, target: Path) -> None:
-    """The tuned filter of another run."""
-    for name in ("filter.pt", "report.json"):
-        try:
-            content = (source / name).read_bytes()
-        except OSError as error:
-            raise SystemExit(
-                f"--filter {source}: holds no finished tuning of `experiments.catch` ({error})"
-            ) from error
-        with atomic_write(target / name) as file:
-            file.write(content)
+def _take(source: Path, plan: Plan) -> dict[str, bytes]:
+    """The files of another run's tuned filter, which must have been tuned on the same demonstrations."""
+    try:
+        theirs = json.loads((source / "config.json").read_text())["settings"]
+        content = {name: (source / name).read_bytes() for name in ("filter.pt", "report.json")}
+        there = theirs["demonstrations"], theirs["seed"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise SystemExit(f"--filter {source}: no finished tuning of experiments.catch ({error})") from error
+    if there != (plan.demonstrations, plan.seed):
+        raise SystemExit(
+            f"--filter {source}: tuned on {there[0]} demonstrations of seed {there[1]}, "
+            f"not on {plan.demonstrations} of seed {plan.seed}"
+        )
+    return content
 
 
 def _parser() -> argparse.ArgumentParser:

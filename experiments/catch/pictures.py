@@ -83,7 +83,8 @@ def draw_pictures(plan: Plan, method: str, results: Results, folder: Path) -> No
     except NoGraphicsError as error:
         print(f"{error}; plotted instead", file=sys.stderr)
         rendered = [[plotted(one, frame) for frame in one.frames[::STRIDE]] for one in films]
-    strip(films, rendered, method).savefig(folder / "throws.png", dpi=110)
+    with atomic_write(folder / "throws.png") as file:
+        strip(films, rendered, method).savefig(file, format="png", dpi=110)
     animation(folder / "throws.gif", rendered)
 
 

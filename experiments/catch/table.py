@@ -133,7 +133,8 @@ def legend(summary: Mapping[str, Any]) -> str:
         f"{summary['reference']}; within reach: an arm that sets out at the release can get there; distance: of the "
         "ball from the box's centre at its closest, median and quartiles; ahead of release: how long before it the "
         "box stayed within 20 cm of its final place, median and quartiles; before release: share of throws in which "
-        f"that was before it; cycle: median and 99th percentile, of {BUDGET:.1f} ms"
+        "that was before it (an arm that never moves has that in all); cycle: median and 99th percentile, "
+        f"of {BUDGET:.1f} ms"
     )
 
 

@@ -28,7 +28,7 @@ LATENCY = {
 JITTER = 0.003
 """s, mean of what comes on top, exponentially distributed."""
 OUTSTRETCHED = 1.12
-"""m, from the base axis to the box's centre with the arm stretched: no ball is caught further away."""
+"""m, from the arm's base to the box's centre, nearly stretched: further away nobody tries to catch."""
 
 
 @dataclass(frozen=True)

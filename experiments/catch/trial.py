@@ -76,9 +76,9 @@ def run(
             world.release(toss.position, toss.velocity)
             released = True
         if now >= cycle / RATE - 1e-9:
-            cycle += 1
             if not released:
                 world.carry(toss.hand[min(cycle, len(toss.hand) - 1)])
+            cycle += 1
             if world.touched is None and now <= toss.end:
                 while waiting < len(packets) and packets[waiting].arrival <= now:
                     packet = packets[waiting]

@@ -190,6 +190,7 @@ def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder, start = tmp_path_factory.mktemp("learned"), Start(300.0, 10.0)
     keep(folder, start, tunable(know(100, 0), start, MEMBERS))
     write_json(folder / "report.json", {"start": start._asdict(), "factor_scaled": 300.0})
+    write_json(folder / "config.json", {"settings": {"demonstrations": 100, "seed": 0}})
     return folder
 
 
@@ -248,11 +249,18 @@ def test_pictures_are_drawn_with_and_without_graphics(
         (["--arm", "0"], "--arm between 0 and 1"),
         (["--filter", "/nowhere"], "no finished tuning"),
         (["--lead", "soon"], "--lead"),
+        (["--lead", "inf"], "--lead"),
     ],
 )
 def test_mistakes_are_explained(arguments: list[str], message: str, tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match=message):
         command.main([*arguments, "--out", str(tmp_path / "run")])
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_filter_of_other_demonstrations_is_refused(learned: Path, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match="tuned on 100 demonstrations of seed 0, not on 221 of seed 1"):
+        command.main(["--filter", str(learned), "--seed", "1", "--out", str(tmp_path / "run")])
 
 
 def test_learning_leaves_a_tuned_filter_of_eighty(tmp_path: Path) -> None:

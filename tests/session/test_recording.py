@@ -8,6 +8,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -56,6 +57,11 @@ def test_a_replay_that_differs_says_so(tmp_path: Path) -> None:
     lines[1 + at] = json.dumps(entries[at]) + "\n"
     (tmp_path / "other.jsonl").write_text("".join(lines))
     assert not replay(tmp_path / "other.jsonl", filters()["ebip with options"], primitive()).identical
+    at = next(i for i, entry in enumerate(entries) if entry[0] == "forecast")
+    entries[at][3] = [[1.0, 2.0, 3.0]]  # of another shape
+    lines[1 + at] = json.dumps(entries[at]) + "\n"
+    (tmp_path / "third.jsonl").write_text("".join(lines))
+    assert not replay(tmp_path / "third.jsonl", filters()["ebip with options"], primitive()).identical
 
 
 def test_a_recording_belongs_to_its_filter(tmp_path: Path) -> None:
@@ -97,7 +103,7 @@ HEADER = '{"kind": "torch_ebip session", "format": 1}\n'
         ('["push"]\n', "not a recording"),
         ('{"kind": "torch_ebip session", "format": 7}\n', "format 7, this version reads 1"),
         ("[" * 100_000 + "\n", "damaged"),
-        ("x" * (1 << 20) + "\n", "longer than any line"),
+        ("x" * (1 << 24) + "\n", "longer than any line"),
         (HEADER, "another filter"),
     ],
 )
@@ -109,7 +115,15 @@ def test_what_is_no_recording_is_named(text: str, message: str, tmp_path: Path) 
 
 @pytest.mark.parametrize(
     "line",
-    ['["push", "nose", 0.1, [1.0]]', '["launch", 1]', '["push", "hand"]', '["advance", "soon"]', "{}", "[[1]]"],
+    [
+        '["push", "nose", 0.1, [1.0]]',
+        '["launch", 1]',
+        '["push", "hand"]',
+        '["advance", "soon"]',
+        "{}",
+        "[[1]]",
+        f'["advance", 1{"0" * 400}]',
+    ],
 )
 def test_a_damaged_line_is_named(line: str, tmp_path: Path) -> None:
     record(tmp_path / "log.jsonl")
@@ -123,11 +137,40 @@ def test_a_damaged_line_is_named(line: str, tmp_path: Path) -> None:
 def test_damaged_settings_are_named(tmp_path: Path) -> None:
     record(tmp_path / "log.jsonl")
     lines = (tmp_path / "log.jsonl").read_text().splitlines(keepends=True)
-    for settings in ({}, {"sensors": ["hand"], "window": "wide"}, {"sensors": ["hand"], "unknown": 1}, 3):
+    evil = tmp_path / "evil"
+    good = json.loads(lines[0])["settings"]
+    for settings in (
+        {},
+        3,
+        {**good, "window": "wide"},
+        {**good, "window": math.inf},
+        {**good, "sensors": ["nose"]},
+        {**good, "record": str(evil)},
+    ):
         header: dict[str, Any] = {**json.loads(lines[0]), "settings": settings}
         (tmp_path / "bad.jsonl").write_text(json.dumps(header) + "\n")
         with pytest.raises(ValueError, match="settings of the session are damaged"):
             replay(tmp_path / "bad.jsonl", filters()["ebip with options"], primitive())
+    assert not evil.exists()
+
+
+def test_what_the_session_refused_does_not_spoil_its_recording(tmp_path: Path) -> None:
+    with live(record=tmp_path / "log.jsonl") as session:
+        session.push("hand", (0.1, 1.0), 0.0)
+        for now in (1e6, math.nan, 10**400):
+            with pytest.raises(ValueError, match="now"):
+                session.advance(now)
+        with pytest.raises(ValueError, match="horizons"):
+            session.forecast(math.inf)
+        session.forecast(0.1)
+    assert replay(tmp_path / "log.jsonl", filters()["ebip with options"], primitive()).identical
+
+
+def test_settings_of_any_library_are_recorded(tmp_path: Path) -> None:
+    with live(window=np.float32(0.25), seed=np.int64(2), record=tmp_path / "log.jsonl") as session:
+        session.push("hand", np.array([0.1, 1.0], dtype=np.float32), np.float32(0.1))
+        session.forecast(np.float32(0.1), np.float32(0.2))
+    assert replay(tmp_path / "log.jsonl", filters()["ebip with options"], primitive()).identical
 
 
 def test_a_full_disk_ends_the_recording_and_not_the_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

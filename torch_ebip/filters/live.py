@@ -138,8 +138,10 @@ class LiveFilter:
 
     @property
     def finite(self) -> bool:
-        """Whether the members are."""
-        return math.isfinite(float(self._members.sum()))
+        """Whether members and weights are, and small enough for their variance to be."""
+        flat = self._members.view(-1)
+        size = float(torch.dot(flat, flat))
+        return math.isfinite(size if self._evidence is None else size + float(self._evidence.weights.sum()))
 
     @torch.no_grad()
     def save(self, into: LiveSnapshot | None = None) -> LiveSnapshot:
@@ -153,7 +155,10 @@ class LiveFilter:
 
     @torch.no_grad()
     def load(self, snapshot: LiveSnapshot) -> None:
-        """Go back to a snapshot of this filter: what follows gives the same numbers again, to the bit."""
+        """Go back to a snapshot of this filter: what follows gives the same numbers again, to the bit.
+
+        Draws too, if the filter has a generator; torch's global one is not turned back.
+        """
         self._members.copy_(snapshot.matrix)
         self._evidence = snapshot.evidence
         set_states(self.generator, snapshot.generators)

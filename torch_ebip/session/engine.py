@@ -32,7 +32,7 @@ class Engine(Protocol):
         """Mean phase and mean phase velocity, 1/s."""
 
     def finite(self) -> bool:
-        """Whether the state is."""
+        """Whether the state is, and small enough for its variance to be."""
 
     def forecast(self, phase: Tensor) -> Forecast:
         """Of the controlled DoFs at phases [P]."""
@@ -89,6 +89,13 @@ class _LiveEngine:
         return self._live.forecast(phase, self._controlled)
 
 
+def _tensors(state: Any) -> list[Tensor]:
+    """All tensors of a state, its members or mean first."""
+    if isinstance(state, Tensor):
+        return [state]
+    return [] if state is None else [tensor for part in state for tensor in _tensors(part)]
+
+
 class _StateEngine:
     """By the filter's own steps from state to state; a slot holds a state, which nothing changes."""
 
@@ -131,7 +138,8 @@ class _StateEngine:
 
     def finite(self) -> bool:
         """See `Engine`."""
-        return all(bool(part.isfinite().all()) for part in self._state if isinstance(part, Tensor))
+        first, *rest = _tensors(self._state)
+        return bool(first.square().sum().isfinite()) and not any(bool(part.isnan().any()) for part in rest)
 
     @torch.no_grad()
     def forecast(self, phase: Tensor) -> Forecast:

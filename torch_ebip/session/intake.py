@@ -66,23 +66,25 @@ def training_ranges(primitive: InteractionPrimitive, margin: float) -> Ranges:
 
 @dataclass
 class Freshness:
-    """Which sensors repeat themselves, and which were used when: part of what is wound back.
+    """Which sensors repeat themselves, which were used when, what failed: part of what is wound back.
 
     Attributes:
         values: [D], what each DoF said last; NaN if nothing.
         since: int64 [M], the tick since which each modality has said the same.
         used: int64 [M], the tick at which each modality was used last; -1 if never.
         frozen: int64 [M], how often each was refused.
+        failed: how many ticks the filter could not take in.
     """
 
     values: Array
     since: npt.NDArray[np.int64]
     used: npt.NDArray[np.int64]
     frozen: npt.NDArray[np.int64]
+    failed: int = 0
 
     def copy(self) -> Freshness:
         """Of its own memory."""
-        return Freshness(self.values.copy(), self.since.copy(), self.used.copy(), self.frozen.copy())
+        return Freshness(self.values.copy(), self.since.copy(), self.used.copy(), self.frozen.copy(), self.failed)
 
 
 @dataclass
@@ -182,10 +184,11 @@ class Intake:
         for m, columns in enumerate(self.columns):
             if not usable[columns].any():
                 continue
-            said = values[columns]
-            if not np.array_equal(said, freshness.values[columns], equal_nan=True):
-                freshness.values[columns] = said
+            said, before = values[columns], freshness.values[columns]
+            common = usable[columns] & ~np.isnan(before)
+            if not common.any() or (said[common] != before[common]).any():
                 freshness.since[m] = tick
+            before[usable[columns]] = said[usable[columns]]
             if (tick - freshness.since[m]) * self.dt > patience:
                 freshness.frozen[m] += 1
                 usable[columns] = False
@@ -221,10 +224,11 @@ class Intake:
 def as_vector(values: Any, length: int) -> Array | None:
     """Numbers [length] of whatever a sensor sent; None if it is not that."""
     try:
-        vector = np.asarray(values, dtype=np.float64)
+        vector = np.asarray(values)
+        numbers = vector.dtype.kind in "fiu" and vector.shape == (length,)
+        return vector.astype(np.float64) if numbers else None
     except Exception:  # an object may raise anything when it is asked for numbers
         return None
-    return vector if vector.shape == (length,) else None
 
 
 def as_number(time: Any) -> float:

@@ -15,7 +15,7 @@ from typing import IO, Any
 
 FORMAT = 1
 KIND = "torch_ebip session"
-LONGEST_LINE = 1 << 20
+LONGEST_LINE = 1 << 24
 """Characters; a longer line is not one of ours."""
 
 
@@ -33,8 +33,9 @@ class SessionLog:
 
     def __init__(self, path: str | os.PathLike[str], header: Mapping[str, Any]) -> None:
         self.path = Path(path)
+        first = json.dumps({"kind": KIND, "format": FORMAT, **header}) + "\n"
         self._file: IO[str] | None = self.path.open("x", encoding="utf-8", buffering=1)
-        self.write({"kind": KIND, "format": FORMAT, **header})
+        self._file.write(first)
 
     @property
     def open(self) -> bool:

@@ -13,6 +13,9 @@ from torch_ebip.primitive import InteractionPrimitive
 from torch_ebip.session.log import read_log
 from torch_ebip.session.session import InteractionSession, SessionForecast, fingerprint
 
+SETTINGS = {"sensors", "start", "window", "settle", "margin", "frozen_after", "stale_after", "longest_gap", "seed"}
+"""What a recording says of its session: nothing else of it reaches the constructor."""
+
 
 class Replay(NamedTuple):
     """A session as it was at the end of its recording.
@@ -31,7 +34,7 @@ class Replay(NamedTuple):
     def identical(self) -> bool:
         """Whether every forecast is the recorded one to the bit."""
         pairs = zip(self.forecasts, self.recorded, strict=True)
-        return all(torch.equal(again.mean.reshape(then.shape).cpu(), then) for again, then in pairs)
+        return all(torch.equal(again.mean.cpu().view(-1, len(again.dofs)), then) for again, then in pairs)
 
 
 def replay(path: str | os.PathLike[str], filter: Filter, primitive: InteractionPrimitive) -> Replay:
@@ -51,8 +54,10 @@ def replay(path: str | os.PathLike[str], filter: Filter, primitive: InteractionP
             raise ValueError(f"{path}: recorded with another {name} than this one")
     try:
         settings = dict(header["settings"])
+        if settings.keys() != SETTINGS:
+            raise ValueError(f"expected {', '.join(sorted(SETTINGS))}, got {', '.join(sorted(settings))[:200]}")
         session = InteractionSession(filter, primitive, settings.pop("sensors"), **settings)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, RuntimeError) as error:
         raise ValueError(f"{path}: the settings of the session are damaged: {error}") from error
     forecasts, recorded = [], []
     for entry in entries:
@@ -64,6 +69,6 @@ def replay(path: str | os.PathLike[str], filter: Filter, primitive: InteractionP
             else:
                 forecasts.append(session.forecast(entry[2], entry[1]))
                 recorded.append(torch.tensor(entry[3], dtype=next(filter.parameters()).dtype))
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError, RuntimeError) as error:
             raise ValueError(f"{path}: damaged: {str(entry)[:80]}: {error}") from error
     return Replay(session, forecasts, recorded)

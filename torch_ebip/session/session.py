@@ -27,6 +27,9 @@ from torch_ebip.session.engine import make_engine
 from torch_ebip.session.intake import Freshness, Intake, SensorReport, as_number, as_vector, training_ranges
 from torch_ebip.session.log import SessionLog
 
+TOLERANCE = 1e-3
+"""Ticks by which a time may be short of a tick and still be it: clocks that count from 1970 round to microseconds."""
+
 
 class SessionForecast(NamedTuple):
     """What a session expects.
@@ -55,14 +58,15 @@ class InteractionSession:
     Its methods may be called from several threads; they wait for each other.
 
     Args:
-        filter: of the primitive, tuned or not: any kind. As it is now; not changed.
+        filter: of the primitive, tuned or not: any kind. Not changed, and not to be changed while the session lasts.
         primitive: whose layout names sensors and controlled DoFs, and whose demonstrations say what is plausible.
         sensors: names of the modalities that will be pushed; default: all that are not controlled.
         start: time of phase 0, s, on the clock of all other times.
         window: seconds by which a sample may arrive late; later ones are dropped and counted.
         settle: seconds for which a tick waits for its samples before it is filtered. Sensors that arrive within it
             cost no replay; forecasts go on from the last tick at the speed of the interaction.
-        margin: how far outside the range of the demonstrations a value may lie, in widths of that range.
+        margin: how far outside the range of the demonstrations a value may lie, in widths of that range. Nothing else
+            protects the filter from values that are finite and absurd.
         frozen_after: seconds for which a sensor may repeat itself to the last digit before it is taken for frozen.
         stale_after: seconds without anything usable after which a sensor is reported stale.
         longest_gap: seconds that the present, or a sample, may be ahead of what was filtered last.
@@ -94,10 +98,12 @@ class InteractionSession:
         layout = primitive.layout
         if filter.n_dofs != layout.n_dofs:
             raise ValueError(f"the filter has {filter.n_dofs} DoFs, the primitive's layout {layout.n_dofs}")
-        settings = {"window": window, "frozen_after": frozen_after, "stale_after": stale_after}
-        for name, value in {**settings, "longest_gap": longest_gap}.items():
+        positive = {"window": window, "frozen_after": frozen_after, "stale_after": stale_after}
+        for name, value in {**positive, "longest_gap": longest_gap}.items():
             if not value > 0:
                 raise ValueError(f"{name} must be a positive number of seconds, got {value}")
+        if not (math.isfinite(window) and math.isfinite(longest_gap)):
+            raise ValueError(f"window and longest_gap must be finite, got {window} and {longest_gap}")
         if not (math.isfinite(start) and margin >= 0):
             raise ValueError(f"start must be finite and margin not negative, got {start} and {margin}")
         if not 0 <= settle < window:
@@ -106,6 +112,8 @@ class InteractionSession:
             raise ValueError(f"nothing to forecast: no modality of {', '.join(layout.names)} is controlled")
         if sensors is None:
             sensors = [modality.name for modality in layout.modalities if not modality.controlled]
+        if isinstance(sensors, str) or len(set(sensors)) != len(sensors):
+            raise ValueError(f"sensors must be different names of modalities, got {sensors!r}")
         for name in sensors:
             if layout[name].controlled:
                 raise ValueError(f"{name!r} is controlled by the robot, not a sensor")
@@ -115,7 +123,8 @@ class InteractionSession:
         self.dofs = tuple(dof for dof, ours in zip(layout.dofs, layout.controlled.tolist(), strict=True) if ours)
         self._frozen_after, self._stale_after, self._longest_gap = frozen_after, stale_after, longest_gap
         self._numbers = {name: i for i, name in enumerate(self.sensors)}
-        behind = max(1, math.ceil(window / self.dt))
+        # A sample may belong to a tick half a tick before it was taken.
+        behind = math.floor(window / self.dt + 0.5 + TOLERANCE) + 1
         self._intake = Intake(
             [layout.slice(name) for name in self.sensors],
             training_ranges(primitive, margin),
@@ -125,13 +134,12 @@ class InteractionSession:
             math.ceil(longest_gap / self.dt),
         )
         self._slots = behind + 2
-        self._engine = make_engine(filter, layout.mask(self.sensors), layout.controlled, self._slots, seed)
+        self._engine = make_engine(filter, layout.mask(self.sensors), layout.controlled, self._slots, int(seed))
         self._like = next(filter.parameters())
         self._freshness = [self._intake.fresh() for _ in range(self._slots)]
         self._engine.save(-1 % self._slots)
         self._head, self._dirty = -1, 0
         self._settle, self._now, self._newest = settle, self.start, self.start
-        self._failed = 0
         self._lock = threading.RLock()
         self._log: SessionLog | None = None
         if record is not None:
@@ -139,13 +147,15 @@ class InteractionSession:
                 "filter": fingerprint(filter),
                 "primitive": fingerprint(primitive),
                 "settings": {
-                    **settings,
                     "sensors": list(self.sensors),
                     "start": self.start,
-                    "settle": settle,
-                    "margin": margin,
-                    "longest_gap": longest_gap,
-                    "seed": seed,
+                    "window": float(window),
+                    "settle": float(settle),
+                    "margin": float(margin),
+                    "frozen_after": float(frozen_after),
+                    "stale_after": float(stale_after),
+                    "longest_gap": float(longest_gap),
+                    "seed": int(seed),
                 },
             }
             self._log = SessionLog(record, header)
@@ -170,9 +180,9 @@ class InteractionSession:
                 vector = as_vector(values, columns.stop - columns.start)
                 self._log.write(["push", sensor, as_number(time), None if vector is None else vector.tolist()])
             tick = self._intake.put(number, values, time, self._head)
+            self._newest = max(self._newest, self._intake.reports[number].last)
             if tick is not None:
                 self._dirty = min(self._dirty, tick)
-                self._newest = max(self._newest, self._intake.reports[number].last)
 
     def advance(self, now: float | None = None) -> None:
         """Filter up to the present.
@@ -183,10 +193,11 @@ class InteractionSession:
         Raises:
             ValueError: it is not finite, or further ahead than ``longest_gap``.
         """
+        now = _plain(now)
         with self._lock:
-            if self._log is not None:
-                self._log.write(["advance", _plain(now)])
             self._advance(now)
+            if self._log is not None:
+                self._log.write(["advance", now])
 
     def forecast(self, horizon: float | Sequence[float] | None = None, now: float | None = None) -> SessionForecast:
         """Filter up to the present, and say what the controlled DoFs should be.
@@ -199,6 +210,7 @@ class InteractionSession:
         Raises:
             ValueError: see `advance`; a horizon that is not finite.
         """
+        now = _plain(now)
         several = horizon is not None and np.ndim(horizon) > 0
         horizons = [] if horizon is None else np.atleast_1d(np.asarray(horizon, dtype=np.float64)).tolist()
         if not all(math.isfinite(h) for h in horizons):
@@ -213,7 +225,7 @@ class InteractionSession:
             mean, deviation = expected.mean, expected.variance.sqrt()
             if self._log is not None:
                 asked = horizons if several else horizons[0] if horizons else None
-                self._log.write(["forecast", _plain(now), asked, mean.tolist()])
+                self._log.write(["forecast", now, asked, mean.tolist()])
             if not several:
                 mean, deviation = mean[0], deviation[0]
             phase = min(max(phase, 0.0), 1.0)
@@ -223,7 +235,8 @@ class InteractionSession:
     @property
     def failed_updates(self) -> int:
         """How many ticks were left out because the filter could not take them in."""
-        return self._failed
+        with self._lock:
+            return self._current().failed
 
     def report(self) -> dict[str, SensorReport]:
         """What became of everything that was pushed, by sensor."""
@@ -232,8 +245,9 @@ class InteractionSession:
 
     def close(self) -> None:
         """End the recording, if there is one."""
-        if self._log is not None:
-            self._log.close()
+        with self._lock:
+            if self._log is not None:
+                self._log.close()
 
     def __enter__(self) -> InteractionSession:
         return self
@@ -266,8 +280,7 @@ class InteractionSession:
                     f"{self._longest_gap} s; begin a new session"
                 )
         self._now = max(self._now, self._newest if now is None else now)
-        # A time that should be a tick may be a rounding error short of it.
-        newest = math.floor((self._now - self._settle - self.start) / self.dt + 1e-6)
+        newest = math.floor((self._now - self._settle - self.start) / self.dt + TOLERANCE)
         if self._dirty <= self._head:
             self._head = self._dirty - 1
             self._engine.load(self._head % self._slots)
@@ -291,7 +304,7 @@ class InteractionSession:
                 done = False
             if not done:
                 # Back to before the tick: this one is left out, as if nothing had been measured.
-                self._failed += 1
+                freshness.failed += 1
                 self._engine.load((self._head - 1) % self._slots)
                 if self._head > 0:
                     self._engine.predict()
@@ -299,9 +312,12 @@ class InteractionSession:
         self._engine.save(self._head % self._slots)
 
 
-def _plain(time: float | None) -> float | None:
-    """A number that JSON knows, whatever library it is from."""
-    return None if time is None else float(time)
+def _plain(now: float | None) -> float | None:
+    """A float, whatever library the number is from."""
+    try:
+        return None if now is None else float(now)
+    except (OverflowError, TypeError, ValueError) as error:
+        raise ValueError(f"now must be a finite time in seconds, got {str(now)[:40]}") from error
 
 
 def fingerprint(module: torch.nn.Module) -> str:

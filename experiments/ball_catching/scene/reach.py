@@ -9,12 +9,12 @@ import numpy as np
 from experiments.ball_catching.geometry import Array
 from experiments.ball_catching.scene.model import build, load_mujoco
 
-# What counts as one unit of error, as the teacher feels it (`teacher.solve`): position m, opening rad, posture rad.
+# What counts as one unit of error, as the teacher feels it (`teacher.solve`): m, of a unit vector, rad.
 POSITION, OPENING, POSTURE = 0.002, 0.15, 2.0
 
 
 class Posture(NamedTuple):
-    """Joints [6], rad; how far the box's centre stays off, m, and its opening, rad."""
+    """Joints [6], rad; how far the box's centre stays off, m; distance between unit vectors along its opening."""
 
     joints: Array
     miss: float

@@ -32,6 +32,7 @@ class World:
         self._site = self.model.site("ur5/box").id
         self._body_of_geom = np.array(self.model.geom_bodyid)
         self._ball_collides = int(self.model.geom("ball").conaffinity[0])
+        self.reset(np.zeros(6))
 
     def reset(self, joints: Array) -> None:
         """Time 0: the arm rests at joints [6], rad; the ball is out of the way."""
