@@ -14,7 +14,7 @@ from experiments.ball_catching.scene import Limits, Posture, Reach, travel_time
 from experiments.ball_catching.teacher import LOWEST
 from experiments.catch.throws import OUTSTRETCHED
 from torch_ebip import Filter, InteractionPrimitive
-from torch_ebip.session import InteractionSession
+from torch_ebip.session import InteractionSession, SessionSettings
 
 SETTLE = 0.02
 """s for which a session waits for the sensors of a moment, a little more than the slowest takes."""
@@ -42,7 +42,7 @@ class SessionController:
     """Follows what a filter expects of the robot: the paper's eBIP, and what is compared with it."""
 
     def __init__(self, filter: Filter, primitive: InteractionPrimitive, seed: int, lead: float | None = LEAD) -> None:
-        self.session = InteractionSession(filter, primitive, seed=seed, settle=SETTLE)
+        self.session = InteractionSession(filter, primitive, settings=SessionSettings(settle=SETTLE, seed=seed))
         self.lead = lead
         self.seconds: list[float] = []
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import gc
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from tests.conftest import interactions, small_primitive
 from torch_ebip import BSplineBasis, Filter, InteractionPrimitive, bip, ebip, particle_filter
 from torch_ebip.draws import seeded
 from torch_ebip.filters.localisation import Localisation
-from torch_ebip.session import InteractionSession, SessionForecast
+from torch_ebip.session import InteractionSession, SessionForecast, SessionSettings
 
 DT = 1 / 30
 SENSORS = {"hand": slice(0, 2), "gaze": slice(2, 3)}
@@ -63,8 +64,11 @@ def samples(length: int = 25, index: int = 1, beside: float = 0.0) -> list[Sampl
     return sorted(stream, key=lambda sample: sample[2])
 
 
-def live(name: str = "ebip with options", **settings: Any) -> InteractionSession:
-    return InteractionSession(filters()[name], primitive(), **{"window": 0.3, "margin": 3.0, **settings})
+def live(
+    name: str = "ebip with options", sensors: Sequence[str] | None = None, record: Path | None = None, **settings: Any
+) -> InteractionSession:
+    chosen = SessionSettings(**{"window": 0.3, "margin": 3.0, **settings})
+    return InteractionSession(filters()[name], primitive(), sensors, chosen, record)
 
 
 def everything(session: InteractionSession, now: float) -> list[Tensor]:
@@ -363,11 +367,11 @@ def test_memory_does_not_grow() -> None:
         (lambda: live(sensors=[]), "at least one sensor"),
         (lambda: live(sensors="hand"), "different names"),
         (lambda: live(sensors=["hand", "hand"]), "different names"),
-        (lambda: live(window=math.inf), "must be finite"),
+        (lambda: live(window=math.inf), "window must be finite"),
         (lambda: live().advance(10**400), "now must be a finite"),
         (lambda: live(window=0.0), "window must be a positive"),
         (lambda: live(settle=0.4), "settle must be"),
-        (lambda: live(margin=-1.0), "margin not negative"),
+        (lambda: live(margin=-1.0), "margin must not be negative"),
         (lambda: live(start=math.inf), "start must be finite"),
         (lambda: live().forecast(math.nan), "horizons must be finite"),
         (lambda: live().forecast(now=math.nan), "now must be a finite"),
@@ -381,8 +385,8 @@ def test_mistakes_of_the_caller_are_explained(make: Callable[[], Any], message: 
 
 def test_double_precision_and_another_clock() -> None:
     double = small_primitive(torch.float64)
-    session = InteractionSession(ebip(double), double, start=1e5, margin=3.0)
-    other = InteractionSession(ebip(double), double, margin=3.0)
+    session = InteractionSession(ebip(double), double, settings=SessionSettings(start=1e5, margin=3.0))
+    other = InteractionSession(ebip(double), double, settings=SessionSettings(margin=3.0))
     for sensor, value, time in samples():
         session.push(sensor, value, 1e5 + time)
         other.push(sensor, value, time)

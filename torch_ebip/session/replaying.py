@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import fields
 from typing import NamedTuple
 
 import torch
@@ -12,9 +13,7 @@ from torch_ebip.filters import Filter
 from torch_ebip.primitive import InteractionPrimitive
 from torch_ebip.session.log import read_log
 from torch_ebip.session.session import InteractionSession, SessionForecast, fingerprint
-
-SETTINGS = {"sensors", "start", "window", "settle", "margin", "frozen_after", "stale_after", "longest_gap", "seed"}
-"""What a recording says of its session: nothing else of it reaches the constructor."""
+from torch_ebip.session.settings import SessionSettings
 
 
 class Replay(NamedTuple):
@@ -53,10 +52,11 @@ def replay(path: str | os.PathLike[str], filter: Filter, primitive: InteractionP
         if header.get(name) != fingerprint(module):
             raise ValueError(f"{path}: recorded with another {name} than this one")
     try:
-        settings = dict(header["settings"])
-        if settings.keys() != SETTINGS:
-            raise ValueError(f"expected {', '.join(sorted(SETTINGS))}, got {', '.join(sorted(settings))[:200]}")
-        session = InteractionSession(filter, primitive, settings.pop("sensors"), **settings)
+        known = {field.name for field in fields(SessionSettings)}
+        if set(header["settings"]) != known:
+            raise ValueError(f"expected {', '.join(sorted(known))}, got {str(header['settings'])[:200]}")
+        settings = SessionSettings(**header["settings"])
+        session = InteractionSession(filter, primitive, header["sensors"], settings)
     except (KeyError, TypeError, ValueError, OverflowError, RuntimeError) as error:
         raise ValueError(f"{path}: the settings of the session are damaged: {error}") from error
     forecasts, recorded = [], []

@@ -14,6 +14,7 @@ import math
 import os
 import threading
 from collections.abc import Sequence
+from dataclasses import asdict
 from types import TracebackType
 from typing import Any, NamedTuple
 
@@ -26,6 +27,7 @@ from torch_ebip.primitive import InteractionPrimitive
 from torch_ebip.session.engine import make_engine
 from torch_ebip.session.intake import Freshness, Intake, SensorReport, as_number, as_vector, training_ranges
 from torch_ebip.session.log import SessionLog
+from torch_ebip.session.settings import SessionSettings
 
 TOLERANCE = 1e-3
 """Ticks by which a time may be short of a tick and still be it: clocks that count from 1970 round to microseconds."""
@@ -61,21 +63,12 @@ class InteractionSession:
         filter: of the primitive, tuned or not: any kind. Not changed, and not to be changed while the session lasts.
         primitive: whose layout names sensors and controlled DoFs, and whose demonstrations say what is plausible.
         sensors: names of the modalities that will be pushed; default: all that are not controlled.
-        start: time of phase 0, s, on the clock of all other times.
-        window: seconds by which a sample may arrive late; later ones are dropped and counted.
-        settle: seconds for which a tick waits for its samples before it is filtered. Sensors that arrive within it
-            cost no replay; forecasts go on from the last tick at the speed of the interaction.
-        margin: how far outside the range of the demonstrations a value may lie, in widths of that range. Nothing else
-            protects the filter from values that are finite and absurd.
-        frozen_after: seconds for which a sensor may repeat itself to the last digit before it is taken for frozen.
-        stale_after: seconds without anything usable after which a sensor is reported stale.
-        longest_gap: seconds that the present, or a sample, may be ahead of what was filtered last.
-        seed: of all draws.
+        settings: how to treat them; default: `SessionSettings()`.
         record: file to write everything to that is pushed and asked, for `replay`; must not exist.
 
     Raises:
-        ValueError: a sensor that the layout does not have or that is controlled; no controlled DoF; a setting that
-            is not positive; a filter of other DoFs.
+        ValueError: a sensor that the layout does not have, that is controlled or named twice; no controlled DoF; a
+            filter of other DoFs.
         FileExistsError, OSError: the recording cannot be written.
     """
 
@@ -84,30 +77,12 @@ class InteractionSession:
         filter: Filter,
         primitive: InteractionPrimitive,
         sensors: Sequence[str] | None = None,
-        *,
-        start: float = 0.0,
-        window: float = 0.25,
-        settle: float = 0.0,
-        margin: float = 1.0,
-        frozen_after: float = 0.25,
-        stale_after: float = 0.1,
-        longest_gap: float = 10.0,
-        seed: int = 0,
+        settings: SessionSettings | None = None,
         record: str | os.PathLike[str] | None = None,
     ) -> None:
         layout = primitive.layout
         if filter.n_dofs != layout.n_dofs:
             raise ValueError(f"the filter has {filter.n_dofs} DoFs, the primitive's layout {layout.n_dofs}")
-        positive = {"window": window, "frozen_after": frozen_after, "stale_after": stale_after}
-        for name, value in {**positive, "longest_gap": longest_gap}.items():
-            if not value > 0:
-                raise ValueError(f"{name} must be a positive number of seconds, got {value}")
-        if not (math.isfinite(window) and math.isfinite(longest_gap)):
-            raise ValueError(f"window and longest_gap must be finite, got {window} and {longest_gap}")
-        if not (math.isfinite(start) and margin >= 0):
-            raise ValueError(f"start must be finite and margin not negative, got {start} and {margin}")
-        if not 0 <= settle < window:
-            raise ValueError(f"settle must be at least 0 and less than the window of {window} s, got {settle}")
         if not bool(layout.controlled.any()):
             raise ValueError(f"nothing to forecast: no modality of {', '.join(layout.names)} is controlled")
         if sensors is None:
@@ -119,44 +94,35 @@ class InteractionSession:
                 raise ValueError(f"{name!r} is controlled by the robot, not a sensor")
         if not sensors:
             raise ValueError("a session needs at least one sensor")
-        self.sensors, self.start, self.dt = tuple(sensors), float(start), filter.dt
+        self.settings = settings = SessionSettings() if settings is None else settings
+        self.sensors, self.dt = tuple(sensors), filter.dt
         self.dofs = tuple(dof for dof, ours in zip(layout.dofs, layout.controlled.tolist(), strict=True) if ours)
-        self._frozen_after, self._stale_after, self._longest_gap = frozen_after, stale_after, longest_gap
         self._numbers = {name: i for i, name in enumerate(self.sensors)}
         # A sample may belong to a tick half a tick before it was taken.
-        behind = math.floor(window / self.dt + 0.5 + TOLERANCE) + 1
+        behind = math.floor(settings.window / self.dt + 0.5 + TOLERANCE) + 1
         self._intake = Intake(
             [layout.slice(name) for name in self.sensors],
-            training_ranges(primitive, margin),
-            self.start,
+            training_ranges(primitive, settings.margin),
+            settings.start,
             self.dt,
             behind,
-            math.ceil(longest_gap / self.dt),
+            math.ceil(settings.longest_gap / self.dt),
         )
         self._slots = behind + 2
-        self._engine = make_engine(filter, layout.mask(self.sensors), layout.controlled, self._slots, int(seed))
+        self._engine = make_engine(filter, layout.mask(self.sensors), layout.controlled, self._slots, settings.seed)
         self._like = next(filter.parameters())
         self._freshness = [self._intake.fresh() for _ in range(self._slots)]
         self._engine.save(-1 % self._slots)
         self._head, self._dirty = -1, 0
-        self._settle, self._now, self._newest = settle, self.start, self.start
+        self._now = self._newest = settings.start
         self._lock = threading.RLock()
         self._log: SessionLog | None = None
         if record is not None:
             header = {
                 "filter": fingerprint(filter),
                 "primitive": fingerprint(primitive),
-                "settings": {
-                    "sensors": list(self.sensors),
-                    "start": self.start,
-                    "window": float(window),
-                    "settle": float(settle),
-                    "margin": float(margin),
-                    "frozen_after": float(frozen_after),
-                    "stale_after": float(stale_after),
-                    "longest_gap": float(longest_gap),
-                    "seed": int(seed),
-                },
+                "sensors": list(self.sensors),
+                "settings": asdict(settings),
             }
             self._log = SessionLog(record, header)
 
@@ -219,7 +185,7 @@ class InteractionSession:
             self._advance(now)
             phase, velocity = self._engine.clock()
             # Since the last tick the interaction went on.
-            phase += velocity * (self._now - (self.start + max(self._head, 0) * self.dt))
+            phase += velocity * (self._now - self._time(max(self._head, 0)))
             phases = [1.0] if horizon is None else [min(max(phase + velocity * h, 0.0), 1.0) for h in horizons]
             expected = self._engine.forecast(self._like.new_tensor(phases))
             mean, deviation = expected.mean, expected.variance.sqrt()
@@ -260,27 +226,28 @@ class InteractionSession:
     def _current(self) -> Freshness:
         return self._freshness[self._head % self._slots]
 
+    def _time(self, tick: int) -> float:
+        return self.settings.start + tick * self.dt
+
     def _stale(self) -> tuple[str, ...]:
-        oldest = self._now - self._stale_after
+        oldest = self._now - self.settings.stale_after
         used = self._current().used.tolist()
         return tuple(
-            name
-            for name, tick in zip(self.sensors, used, strict=True)
-            if tick < 0 or self.start + tick * self.dt < oldest
+            name for name, tick in zip(self.sensors, used, strict=True) if tick < 0 or self._time(tick) < oldest
         )
 
     def _advance(self, now: float | None) -> None:
         if now is not None:
             if not math.isfinite(now):
                 raise ValueError(f"now must be a finite time in seconds, got {now}")
-            gap = now - (self.start + max(self._head, 0) * self.dt)
-            if gap > self._longest_gap:
+            gap = now - self._time(max(self._head, 0))
+            if gap > self.settings.longest_gap:
                 raise ValueError(
                     f"now = {now} s is {gap:.1f} s after what was filtered last, more than the longest gap of "
-                    f"{self._longest_gap} s; begin a new session"
+                    f"{self.settings.longest_gap} s; begin a new session"
                 )
         self._now = max(self._now, self._newest if now is None else now)
-        newest = math.floor((self._now - self._settle - self.start) / self.dt + TOLERANCE)
+        newest = math.floor((self._now - self.settings.settle - self.settings.start) / self.dt + TOLERANCE)
         if self._dirty <= self._head:
             self._head = self._dirty - 1
             self._engine.load(self._head % self._slots)
@@ -294,7 +261,7 @@ class InteractionSession:
         self._head += 1
         if self._head > 0:
             self._engine.predict()
-        values, usable = self._intake.usable(self._head, freshness, self._frozen_after)
+        values, usable = self._intake.usable(self._head, freshness, self.settings.frozen_after)
         if usable.any():
             y = torch.as_tensor(values, dtype=self._like.dtype, device=self._like.device)
             try:
