@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import settings
 
 from torch_ebip import BSplineBasis, Demonstrations, InteractionPrimitive, Layout, Modality, StackedBasis
 
 torch.set_num_threads(1)
+# The same examples each time; HYPOTHESIS_PROFILE=random looks for new ones.
+settings.register_profile("fixed", derandomize=True, deadline=None)
+settings.register_profile("random", deadline=None)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))
 SHARED = Path(__file__).parents[2] / "shared" / "data" / "handover.npz"
 
 

@@ -41,3 +41,10 @@ def test_imports_run_one_way() -> None:
             assert not re.search(r"^\s*(from|import) .*tensorboard", text, re.MULTILINE), path
         if path.parent.name != "kinematics":
             assert not re.search(r"^\s*(from|import) pytorch_kinematics", text, re.MULTILINE), path
+
+
+def test_only_the_scene_knows_the_simulator() -> None:
+    for folder in ("torch_ebip", "experiments"):
+        for path in (ROOT / folder).rglob("*.py"):
+            known = path.parent.name == "scene"
+            assert known or not re.search(r"^\s*(from|import) mujoco", path.read_text(), re.MULTILINE), path

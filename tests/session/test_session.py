@@ -108,7 +108,7 @@ def test_a_stream_in_order_is_the_filter(name: str) -> None:
     assert told.dofs == ("arm.1", "arm.2")
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
 @given(
     delays=st.lists(st.one_of(st.floats(0.0, 0.3), st.just(0.3)), min_size=46, max_size=46),
     polls=st.lists(st.booleans(), min_size=46, max_size=46),
@@ -150,7 +150,7 @@ value = st.one_of(
 moment = st.one_of(st.floats(-0.1, 1.2), number, st.none(), st.text(max_size=2))
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=60, suppress_health_check=[HealthCheck.too_slow])
 @given(
     garbage=st.lists(st.tuples(st.sampled_from(["hand", "gaze"]), value, moment), max_size=40),
     name=st.sampled_from(["ebip", "ebip with options", "weighted", "localised", "bip", "particle filter"]),
