@@ -195,6 +195,28 @@ def test_an_update_that_fails_is_left_out(name: str, monkeypatch: pytest.MonkeyP
     assert same(everything(session, 1.0), everything(other, 1.0))
 
 
+def test_an_update_that_leaves_the_state_infinite_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An update that comes back as if nothing were wrong."""
+    session, other = live("particle filter"), live("particle filter")
+    update = session._engine.update
+
+    def poison(y: Tensor, measured: tuple[bool, ...]) -> None:
+        update(y, measured)
+        if 0.39 < session._now < 0.41:
+            state = session._engine._state  # type: ignore[attr-defined]
+            session._engine._state = state._replace(members=state.members * 1e30)  # type: ignore[attr-defined]
+
+    monkeypatch.setattr(session._engine, "update", poison)
+    for sensor, value, time in samples():
+        session.push(sensor, value, time)
+        session.advance(time)
+        if not 0.39 < time < 0.41:
+            other.push(sensor, value, time)
+        other.advance(time)
+    assert session.failed_updates == 1
+    assert same(everything(session, 1.0), everything(other, 1.0))
+
+
 def test_what_was_refused_is_counted() -> None:
     session = live(margin=0.5)
     stream = samples()
