@@ -13,7 +13,9 @@ import pytest
 import torch
 
 from tests.test_tuning import filter_and_tuner
+from torch_ebip import ebip
 from torch_ebip.monitor import Monitor, noise_scalars
+from torch_ebip.noise import StudentT
 
 
 def free_port() -> int:
@@ -96,3 +98,9 @@ def test_constrained_values_are_logged_not_raw_ones() -> None:
     assert values["R_phase/gaze/1.00"] == pytest.approx(2.718, rel=1e-3)
     assert values["R_phase/gaze/0.00"] == pytest.approx(1.0)
     assert values["R/gaze"] == pytest.approx(float(closed[2]) * 2.718, rel=1e-3)
+
+
+def test_the_tails_of_a_robust_filter_are_logged() -> None:
+    _, tuner = filter_and_tuner()
+    values = noise_scalars(ebip(tuner.primitive, robust=StudentT(3.0)), tuner.layout)
+    assert values["R_robust/StudentT"] == pytest.approx(3.0)

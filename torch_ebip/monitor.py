@@ -12,7 +12,7 @@ from torch import nn
 from torch_ebip.filters.evidence import EvidenceWeighting
 from torch_ebip.filters.localisation import Localisation
 from torch_ebip.layout import Layout
-from torch_ebip.noise import AboveOne, MeasurementNoise, PhaseNoise, WeightNoise
+from torch_ebip.noise import AboveOne, MeasurementNoise, PhaseNoise, RobustWeights, WeightNoise
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -71,7 +71,7 @@ def noise_scalars(filter: nn.Module, layout: Layout) -> dict[str, float]:
 
     - ``R/MODALITY``: geometric mean over its DoFs of the standard deviation, in its unit, and ``R_factor/DOF``
       the variance relative to the start;
-    - ``R_phase/MODALITY/PHASE``: factor on the variance at that phase;
+    - ``R_phase/MODALITY/PHASE``: factor on the variance at that phase, ``R_robust/KIND`` the scale of its tails;
     - ``Q/...``: acceleration of the phase (1/s^2) and rates of the weights (1/sqrt(s));
     - ``localisation/A~B``, ``inflation`` and ``weighting/...``, see `EvidenceWeighting`.
     """
@@ -101,6 +101,8 @@ def noise_scalars(filter: nn.Module, layout: Layout) -> dict[str, float]:
                 values |= {f"weighting/factor/{name}": factor for name, factor in factors}
             elif isinstance(module, AboveOne):
                 values["inflation"] = float(module.value)
+            elif isinstance(module, RobustWeights):
+                values[f"R_robust/{type(module).__name__}"] = float(module.scale.value)
     return values
 
 

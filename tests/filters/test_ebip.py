@@ -7,7 +7,7 @@ import torch
 from tests.conftest import interactions, small_primitive
 from tests.filters.contract import FilterContract
 from torch_ebip import BSplineBasis, Demonstrations, EnsembleFilter, InteractionPrimitive, ebip
-from torch_ebip.noise import AboveOne, Positive
+from torch_ebip.noise import AboveOne, Huber, Positive, StudentT
 
 
 class TestPlain(FilterContract):
@@ -23,13 +23,13 @@ class TestEverything(FilterContract):
         primitive = small_primitive(dtype)
         one = primitive.weights.new_tensor(1.01)
         options = {"context": BSplineBasis(4), "localise": True, "inflation": AboveOne(one), "weight_noise": 0.01}
-        return ebip(primitive, 20, **options, weigh=True)
+        return ebip(primitive, 20, **options, weigh=True, robust=StudentT())
 
     def make_without_draws(self) -> EnsembleFilter:
         primitive = small_primitive(torch.float64)
         one = primitive.weights.new_tensor(1.01)
         options = {"context": BSplineBasis(4), "localise": True, "inflation": AboveOne(one)}
-        return silent(ebip(primitive, 20, **options, weigh=True, square_root=True))
+        return silent(ebip(primitive, 20, **options, weigh=True, square_root=True, robust=Huber()))
 
 
 def silent(filter: EnsembleFilter) -> EnsembleFilter:

@@ -9,6 +9,7 @@ from tests.filters.contract import FilterContract
 from tests.filters.test_ebip import silent
 from torch_ebip import BSplineBasis, ExtendedFilter, GaussianBasis, InteractionPrimitive, StackedBasis, bip, ebip
 from torch_ebip.filters import ConstantVelocityPhase, GaussianState, MomentPrior
+from torch_ebip.noise import StudentT
 
 HUMAN = torch.tensor([True, True, True, False, False])
 
@@ -23,7 +24,8 @@ class TestPlain(FilterContract):
 
 class TestEverything(FilterContract):
     def make(self, dtype: torch.dtype = torch.float32) -> ExtendedFilter:
-        return bip(small_primitive(dtype), context=BSplineBasis(4), weight_noise=0.1, shrinkage=0.2)
+        options = {"context": BSplineBasis(4), "weight_noise": 0.1, "shrinkage": 0.2, "robust": StudentT(2.0)}
+        return bip(small_primitive(dtype), **options)
 
     def make_without_draws(self) -> ExtendedFilter:
         return self.make(torch.float64)

@@ -14,6 +14,7 @@ from torch_ebip import BSplineBasis, EnsembleFilter, GaussianBasis, InteractionP
 from torch_ebip.filters import ConstantVelocityPhase, LiveFilter
 from torch_ebip.filters.plan import PLANS, kept
 from torch_ebip.filters.span import SpanMembers
+from torch_ebip.noise import Huber, StudentT
 
 HUMAN = torch.tensor([True, True, True, False, False])
 OPTIONS: dict[str, dict[str, Any]] = {
@@ -23,6 +24,14 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "evidence": {"weigh": True},
     "context": {"context": BSplineBasis(4)},
     "all": {"square_root": True, "inflation": 1.02, "weigh": True, "context": BSplineBasis(4)},
+    "robust": {"robust": StudentT()},
+    "all and robust": {
+        "square_root": True,
+        "inflation": 1.02,
+        "weigh": True,
+        "context": BSplineBasis(4),
+        "robust": Huber(1.0),
+    },
 }
 
 

@@ -13,7 +13,7 @@ from tests.filters.test_ebip import silent
 from tests.filters.test_kalman import Additive, Linear
 from torch_ebip import BSplineBasis, ParticleFilter, functional, particle_filter
 from torch_ebip.filters import GaussianPrior, ParticleState
-from torch_ebip.noise import FilterNoise, MeasurementNoise
+from torch_ebip.noise import FilterNoise, Gate, MeasurementNoise
 
 
 class TestPlain(FilterContract):
@@ -31,12 +31,12 @@ class TestEverything(FilterContract):
     def make(self, dtype: torch.dtype = torch.float32) -> ParticleFilter:
         primitive = small_primitive(dtype)
         variance = 300 * primitive.residual_variance
-        options = {"context": BSplineBasis(4), "weight_noise": 0.1, "softness": 0.2}
+        options = {"context": BSplineBasis(4), "weight_noise": 0.1, "softness": 0.2, "robust": Gate(3.0)}
         return particle_filter(primitive, 20, residual_variance=variance, **options)
 
     def make_without_draws(self) -> ParticleFilter:
         primitive = small_primitive(torch.float64)
-        made = silent(particle_filter(primitive, 20, context=BSplineBasis(4)))
+        made = silent(particle_filter(primitive, 20, context=BSplineBasis(4), robust=Gate(3.0)))
         made.threshold = 0.0
         return made
 

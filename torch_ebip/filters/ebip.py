@@ -12,6 +12,7 @@ from torch_ebip.filters.localisation import Localisation
 from torch_ebip.filters.mixture import MixturePrior, fit_responsibilities
 from torch_ebip.filters.model import demonstration_states, interaction_model
 from torch_ebip.filters.priors import DemonstrationPrior
+from torch_ebip.noise.robust import RobustWeights
 from torch_ebip.primitive import InteractionPrimitive
 
 
@@ -22,6 +23,7 @@ def ebip(
     residual_variance: Tensor | None = None,
     weight_noise: float | None = None,
     context: Basis | None = None,
+    robust: RobustWeights | None = None,
     localise: bool = False,
     inflation: float | nn.Module | None = None,
     square_root: bool = False,
@@ -39,6 +41,7 @@ def ebip(
             ``primitive.correlated_residual_variance``.
         weight_noise: rate of the weights' random walk at the start, 1/sqrt(s); see `WeightNoise`.
         context: functions of phase for an R that depends on it; see `MeasurementNoise`.
+        robust: what surprising measurements count: `StudentT`, `Huber` or `Gate`, see `RobustWeights`.
         localise: learn factors between modalities; see `Localisation`.
         inflation: of the anomalies; see `EnsembleFilter`.
         square_root: deterministic update.
@@ -50,7 +53,7 @@ def ebip(
     """
     prior = DemonstrationPrior(demonstration_states(primitive))
     count = len(primitive) if n_members is None else n_members
-    options = (residual_variance, weight_noise, context, localise, inflation, square_root, weigh, sharpness)
+    options = (residual_variance, weight_noise, context, robust, localise, inflation, square_root, weigh, sharpness)
     return _build(primitive, prior, count, *options)
 
 
@@ -63,6 +66,7 @@ def ebip_minus(
     residual_variance: Tensor | None = None,
     weight_noise: float | None = None,
     context: Basis | None = None,
+    robust: RobustWeights | None = None,
     localise: bool = False,
     inflation: float | nn.Module | None = None,
     square_root: bool = False,
@@ -77,7 +81,7 @@ def ebip_minus(
         n_members: E; may be more than there are demonstrations.
         max_components: largest number of components to try.
         seed: of the initialisation of EM.
-        residual_variance, weight_noise, context, localise, inflation, square_root: see `ebip`.
+        residual_variance, weight_noise, context, robust, localise, inflation, square_root: see `ebip`.
 
     Returns:
         A filter with parameters of its own, in the dtype and on the device of the primitive.
@@ -87,7 +91,7 @@ def ebip_minus(
     """
     states = demonstration_states(primitive)
     prior = MixturePrior(states, fit_responsibilities(primitive.weights, max_components, seed))
-    options = (residual_variance, weight_noise, context, localise, inflation, square_root)
+    options = (residual_variance, weight_noise, context, robust, localise, inflation, square_root)
     return _build(primitive, prior, n_members, *options)
 
 
@@ -98,13 +102,14 @@ def _build(
     residual_variance: Tensor | None,
     weight_noise: float | None,
     context: Basis | None,
+    robust: RobustWeights | None,
     localise: bool,
     inflation: float | nn.Module | None,
     square_root: bool,
     weigh: bool = False,
     sharpness: float = 1.0,
 ) -> EnsembleFilter:
-    model = interaction_model(primitive, residual_variance, weight_noise, context)
+    model = interaction_model(primitive, residual_variance, weight_noise, context, robust)
     layout = primitive.layout
     localisation = None
     if localise:

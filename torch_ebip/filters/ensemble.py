@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch_ebip import functional
 from torch_ebip.draws import Generators, is_several, standard_normal
 from torch_ebip.filters.base import Trace
-from torch_ebip.filters.evidence import Evidence, EvidenceWeighting
+from torch_ebip.filters.evidence import EvidenceWeighting
 from torch_ebip.filters.in_place import filter_in_place
 from torch_ebip.filters.interaction import BasisProjection, ConstantVelocityPhase
 from torch_ebip.filters.localisation import Localisation
@@ -104,16 +104,30 @@ class EnsembleFilter(MemberFilter):
             return state, state.members.new_zeros(observed.shape[:-1])
         rows = None if bool(measured.all()) else measured.nonzero().squeeze(-1)
         members, weights = state.members, state.weights
-        phase, projections, evidence = self._measure(state, y, observed, rows)
+        phase, projections, paths = self._measure(state, rows)
         deviation = self._deviation(phase)
         taper = None if self.localisation is None else self.localisation()
         if rows is not None:
             y, observed, deviation = y[..., rows], observed[..., rows], deviation[..., rows]
             taper = None if taper is None else Taper(taper.state[:, rows], taper.observation[rows][:, rows])
+        trust = None
+        if self.noise.robust is not None:
+            mean = functional.ensemble_mean(projections, weights)
+            spread = functional.ensemble_variance(projections, weights)
+            y, deviation, trust = self.noise.robust(
+                torch.where(observed, y, 0), mean, spread, deviation, self.thinning
+            )
+            trust = torch.where(observed, trust, 0)
+        evidence = state.evidence
+        if self.weighting is not None and evidence is not None and paths is not None and phase is not None:
+            columns = self.columns
+            if rows is not None:
+                columns = rows if columns is None else columns[rows]
+            evidence = self.weighting.learn(evidence, paths, y, observed, phase, columns, trust)
         factor = torch.diag_embed(deviation)
         growth = None
         if self.inflation is not None:
-            growth = torch.where(observed.any(-1), self._inflation_factor(members) ** self.thinning, 1)
+            growth = self._growth(members, observed.any(-1) if trust is None else trust.amax(-1))
         try:
             if self.square_root:
                 updated, likelihood = functional.square_root_update(
@@ -131,27 +145,22 @@ class EnsembleFilter(MemberFilter):
             raise self._named(error, rows) from error
         return EnsembleState(updated, evidence), likelihood
 
-    def _measure(
-        self, state: EnsembleState, y: Tensor, observed: Tensor, rows: Tensor | None
-    ) -> tuple[Tensor | None, Tensor, Evidence | None]:
-        """Mean phase [...], projections [..., E, k] of some DoFs, and the evidence with y [..., D] added to it."""
-        members, weights, evidence = state.members, state.weights, state.evidence
+    def _measure(self, state: EnsembleState, rows: Tensor | None) -> tuple[Tensor | None, Tensor, Tensor | None]:
+        """Mean phase [...], projections [..., E, k] of some DoFs, and those of the demonstrations behind them."""
+        members, evidence = state.members, state.evidence
         if not isinstance(self.observation, BasisProjection):
-            return self._phase_or_none(state), self._project_rows(members, rows), evidence
-        weighting = self.weighting
-        origin, offsets = (
-            (None, None) if evidence is None or weighting is None else (evidence.origin, weighting.offsets)
-        )
+            return self._phase_or_none(state), self._project_rows(members, rows), None
+        origin, offsets = None, None
+        if evidence is not None and self.weighting is not None:
+            origin, offsets = evidence.origin, self.weighting.offsets
         dofs = None if rows is None else rows.tolist()
         phases, projections, paths = self.observation.measure(members, dofs, origin, offsets)
-        phase = functional.ensemble_mean(phases.unsqueeze(-1), weights).squeeze(-1)
-        if weighting is not None and evidence is not None and paths is not None:
-            columns = self.columns
-            if rows is not None:
-                y, observed = y[..., rows], observed[..., rows]
-                columns = rows if columns is None else columns[rows]
-            evidence = weighting.learn(evidence, paths, y, observed, phase, columns)
-        return phase, projections, evidence
+        return functional.ensemble_mean(phases.unsqueeze(-1), state.weights).squeeze(-1), projections, paths
+
+    def _growth(self, members: Tensor, share: Tensor) -> Tensor:
+        """Inflation [...] after a sample that counts for a share [...] of one, in [0, 1]."""
+        whole: Tensor = self._inflation_factor(members) ** self.thinning
+        return 1 + (whole - 1) * share.to(members)
 
     def _inflation_factor(self, members: Tensor) -> Tensor:
         value = self.inflation.value if isinstance(self.inflation, nn.Module) else self.inflation

@@ -105,6 +105,7 @@ class EvidenceWeighting(nn.Module):
         observed: Tensor,
         phase: Tensor,
         columns: Tensor | None,
+        trust: Tensor | None = None,
     ) -> Evidence:
         """Take in a sample.
 
@@ -116,12 +117,15 @@ class EvidenceWeighting(nn.Module):
             observed: bool [..., D].
             phase: [...], mean phase.
             columns: int64 [D], which of this module's DoFs these are; default: all.
+            trust: [..., D], in [0, 1], what each value counts, 0 where not observed; default: all alike.
         """
         variance = self.variance if columns is None else self.variance[columns]
         modality = self.modality_of_dof if columns is None else self.modality_of_dof[columns]
         # A DoF that never moved in the demonstrations says nothing about which of them this is.
         scale = torch.where(variance > 0, self.factor.value[modality] / torch.where(variance > 0, variance, 1), 0)
-        scale = torch.where(observed, scale, 0) / observed.sum(-1, keepdim=True).clamp(min=1)
+        share = observed.to(scale) if trust is None else trust
+        count = observed.sum(-1, keepdim=True).clamp(min=1)
+        scale = torch.where(observed, scale, 0) * share / count
         difference = projections - torch.where(observed, y, 0)[..., None, None, :]
         distance = (difference.square() @ scale[..., None, :, None]).squeeze(-1)
         temper = 0.5 * self.sharpness.value * torch.exp(self.slope.value * (phase - 0.5))
@@ -129,7 +133,7 @@ class EvidenceWeighting(nn.Module):
         likelihood = torch.logsumexp(prior - distance * temper[..., None, None], -1)
         any_observed = observed.any(-1)
         misfit = evidence.misfit - likelihood / temper.unsqueeze(-1)
-        seen = evidence.seen + any_observed.to(distance)
+        seen = evidence.seen + (share.sum(-1) / count.squeeze(-1))
         mean = misfit / torch.where(seen > 0, seen, 1).unsqueeze(-1)
         weights = torch.softmax(-mean * temper.unsqueeze(-1), dim=-1)
         weights = (1 - self.defensive) * weights + self.defensive / weights.shape[-1]

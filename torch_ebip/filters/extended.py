@@ -24,6 +24,7 @@ from torch_ebip.filters.priors import MomentPrior
 from torch_ebip.functional import FactorisationError, add_product, cholesky
 from torch_ebip.noise.pair import FilterNoise
 from torch_ebip.noise.process import InteractionNoise
+from torch_ebip.noise.robust import RobustWeights
 from torch_ebip.primitive import InteractionPrimitive
 
 
@@ -105,6 +106,11 @@ class ExtendedFilter(Filter):
         cross = by_jacobian(covariance)  # Sigma H', [..., n, D]
         innovation = by_jacobian(cross.transpose(-1, -2))
         innovation = 0.5 * (innovation + innovation.transpose(-1, -2))
+        values = torch.where(observed, y, 0)
+        predicted = torch.where(observed, self._rows(self.project(state), rows), 0)
+        if self.noise.robust is not None:
+            spread = innovation.diagonal(dim1=-2, dim2=-1)
+            values, deviation, _ = self.noise.robust(values, predicted, spread, deviation, self.thinning)
         R = torch.where(observed, deviation.square(), 0)
         S = innovation + torch.diag_embed(torch.where(observed, R, 1))
         scale = S.diagonal(dim1=-2, dim2=-1).sqrt()
@@ -112,7 +118,7 @@ class ExtendedFilter(Filter):
             factor = cholesky(S / (scale.unsqueeze(-1) * scale.unsqueeze(-2)), rows)
         except FactorisationError as error:
             raise self._named(error, rows) from error
-        residual = torch.where(observed, y, 0) - torch.where(observed, self._rows(self.project(state), rows), 0)
+        residual = values - predicted
         gain = torch.cholesky_solve(cross.transpose(-1, -2) / scale.unsqueeze(-1), factor) / scale.unsqueeze(-1)
         gain = gain.transpose(-1, -2)
         mean = mean + (gain @ residual.unsqueeze(-1)).squeeze(-1)
@@ -205,6 +211,7 @@ def bip(
     weight_noise: float | None = None,
     context: Basis | None = None,
     shrinkage: float = 0.0,
+    robust: RobustWeights | None = None,
 ) -> ExtendedFilter:
     """The paper's BIP: a Gaussian prior with the demonstrations' moments and an extended Kalman filter.
 
@@ -213,14 +220,14 @@ def bip(
 
     Args:
         primitive: of the demonstrations.
-        residual_variance, weight_noise, context: see `interaction_model`.
+        residual_variance, weight_noise, context, robust: see `interaction_model`.
         shrinkage: of the prior covariance towards its diagonal, in [0, 1]; see `MomentPrior`. With fewer
             demonstrations than weights the covariance is rank deficient, in the paper and by default.
 
     Returns:
         A filter with parameters of its own, in the dtype and on the device of the primitive.
     """
-    model = interaction_model(primitive, residual_variance, weight_noise, context)
+    model = interaction_model(primitive, residual_variance, weight_noise, context, robust)
     prior = MomentPrior(demonstration_states(primitive), shrinkage)
     return ExtendedFilter(
         model.dynamics, model.observation, model.noise, prior, model.n_dofs, model.dt, dof_names=model.dof_names

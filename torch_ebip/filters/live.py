@@ -107,6 +107,7 @@ class LiveFilter:
         self._growth = 1.0
         if filter.inflation is not None:
             self._growth = float(filter._inflation_factor(start)) ** filter.thinning
+        self._robust = filter.noise.robust
         self._changing_noise = bool(getattr(filter.noise.measurement, "depends_on_phase", True))
         self._factor: tuple[float, Tensor] | None = None
         self._terms = start.new_empty(math.prod(batch_shape) * len(columns) * E)
@@ -246,6 +247,16 @@ class LiveFilter:
         weighted, share = plan.anomalies_by_member, 1 / (E - 1)
         if weights is not None:
             weighted, share = weighted * member_shares(weighted, weights.squeeze(-1)), 1.0
+        counts = None if seen is None else seen.to(values)
+        if self._robust is not None:
+            plan.check_finite(seen)
+            spread = share * (anomalies * weighted.transpose(-1, -2)).sum(-1, keepdim=True)
+            here = values if seen is None else torch.where(seen, values, 0)
+            values, wider, trust = self._robust(here, mean, spread, deviation, self.filter.thinning)
+            if seen is not None:
+                wider, trust = torch.where(seen, wider, 0), torch.where(seen, trust, 0)
+            R = R + torch.diag_embed((wider.square() - deviation.square())[..., 0])
+            deviation, counts = wider, trust
         S = self._plus_product(R, anomalies, weighted, alpha=share)
         factor, info = torch.linalg.cholesky_ex(S)
         if bool(info.any() if self.batch_shape else info):
@@ -269,8 +280,10 @@ class LiveFilter:
         likelihood = plan.log_likelihood(factor, residual, shift, seen)
         if self._evidence is not None and self._part.weighting is not None:
             here = torch.ones_like(values, dtype=torch.bool) if seen is None else seen
-            self._learn(self._evidence, plan, values[..., 0], here[..., 0])
-        self._move(weighted, moves, share, even, seen)
+            self._learn(
+                self._evidence, plan, values[..., 0], here[..., 0], None if counts is None else counts[..., 0]
+            )
+        self._move(weighted, moves, share, even, counts)
         return likelihood
 
     def _drawn(self, buffer: Tensor) -> Tensor:
@@ -280,16 +293,16 @@ class LiveFilter:
             return buffer.normal_(generator=generator)
         return buffer.copy_(standard_normal(buffer.shape, buffer, self.generator))
 
-    def _move(self, weighted: Tensor, moves: Tensor, share: float, even: Tensor, seen: Tensor | None) -> None:
+    def _move(self, weighted: Tensor, moves: Tensor, share: float, even: Tensor, counts: Tensor | None) -> None:
         """X <- X + share (X weighted) moves in place, then inflated about its mean, the product with ``even``."""
         self._add_product(self._members, self._members @ weighted, moves, alpha=share)
         if self._growth == 1:
             return
         mean = self._members @ even
-        if seen is None:
+        if counts is None:
             self._members.lerp_(mean, 1 - self._growth)
         else:
-            self._members.lerp_(mean, (1 - self._growth) * seen.any(-2, keepdim=True).to(mean))
+            self._members.lerp_(mean, (1 - self._growth) * counts.amax(-2, keepdim=True))
 
     def _deviations(self) -> tuple[Tensor, bool]:
         """Standard deviations of all sensors' DoFs now, and whether they change with phase."""
@@ -308,13 +321,13 @@ class LiveFilter:
             return None
         return Plan(self._basis, self._span, dofs, [self._sensors[dof] for dof in dofs], self._terms)
 
-    def _learn(self, evidence: Evidence, plan: Plan, values: Tensor, seen: Tensor) -> None:
+    def _learn(self, evidence: Evidence, plan: Plan, values: Tensor, seen: Tensor, counts: Tensor | None) -> None:
         weighting = self._part.weighting
         assert weighting is not None
         phases = (self._phase.unsqueeze(-1) + weighting.offsets).clamp(0, 1)
         paths = self._basis.project_paths(phases, evidence.origin, plan.rows.tolist())
         columns = plan.rows if self._part.columns is None else self._part.columns[plan.rows]
-        self._evidence = weighting.learn(evidence, paths, values, seen, self.phase, columns)
+        self._evidence = weighting.learn(evidence, paths, values, seen, self.phase, columns, counts)
 
     def _explain(self, S: Tensor, plan: Plan) -> None:
         try:

@@ -13,6 +13,7 @@ from torch_ebip.filters.interaction import BasisProjection, ConstantVelocityPhas
 from torch_ebip.noise.measurement import MeasurementNoise, SelectedNoise
 from torch_ebip.noise.pair import FilterNoise
 from torch_ebip.noise.process import InteractionNoise, PhaseNoise, WeightNoise
+from torch_ebip.noise.robust import RobustWeights
 from torch_ebip.primitive import InteractionPrimitive
 
 
@@ -45,6 +46,7 @@ def interaction_model(
     residual_variance: Tensor | None = None,
     weight_noise: float | None = None,
     context: Basis | None = None,
+    robust: RobustWeights | None = None,
 ) -> InteractionModel:
     """A model with parameters of its own, in the dtype and on the device of the primitive.
 
@@ -54,6 +56,7 @@ def interaction_model(
             ``primitive.correlated_residual_variance``.
         weight_noise: rate of the weights' random walk at the start, 1/sqrt(s), see `WeightNoise`; default: none.
         context: functions of phase for an R that depends on it; see `MeasurementNoise`.
+        robust: what surprising measurements count, such as `StudentT`; default: as much as others.
     """
     layout, weights = primitive.layout, primitive.weights
     basis = copy.deepcopy(primitive.basis).to(weights)
@@ -67,6 +70,7 @@ def interaction_model(
     noise = FilterNoise(
         InteractionNoise(PhaseNoise(_acceleration(primitive)), walk),
         MeasurementNoise(variance.to(weights), context, modality_of_dof),
+        None if robust is None else copy.deepcopy(robust).to(weights),
     )
     state = torch.arange(2 + basis.n_weights, device=weights.device)
     dofs = torch.arange(layout.n_dofs, device=weights.device)
@@ -116,7 +120,7 @@ def select_dofs(
     return InteractionModel(
         dynamics,
         BasisProjection(observation.basis.select(dofs.cpu())),
-        FilterNoise(process.select(weights, thinning), SelectedNoise(noise.measurement, index)),
+        FilterNoise(process.select(weights, thinning), SelectedNoise(noise.measurement, index), noise.robust),
         len(index),
         dt * thinning,
         None if dof_names is None else tuple(dof_names[i] for i in index.tolist()),

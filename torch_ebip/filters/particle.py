@@ -15,6 +15,7 @@ from torch_ebip.filters.members import MemberFilter
 from torch_ebip.filters.model import demonstration_states, interaction_model
 from torch_ebip.filters.priors import DemonstrationPrior, select_prior
 from torch_ebip.noise.pair import FilterNoise
+from torch_ebip.noise.robust import RobustWeights
 from torch_ebip.primitive import InteractionPrimitive
 
 
@@ -136,9 +137,13 @@ class ParticleFilter(MemberFilter):
             return state, state.members.new_zeros(observed.shape[:-1])
         rows = measured.nonzero().squeeze(-1)
         deviation = self._deviation(self._phase_or_none(state))[..., rows]
-        y, observed = y[..., rows], observed[..., rows]
+        y, observed = torch.where(observed, y, 0)[..., rows], observed[..., rows]
         projections = self._project_rows(state.members, rows)
-        z = (torch.where(observed, y, 0).unsqueeze(-2) - projections) / deviation.unsqueeze(-2)
+        if self.noise.robust is not None:
+            mean = functional.ensemble_mean(projections, state.weights)
+            spread = functional.ensemble_variance(projections, state.weights, unbiased=False)
+            y, deviation, _ = self.noise.robust(y, mean, spread, deviation, self.thinning)
+        z = (y.unsqueeze(-2) - projections) / deviation.unsqueeze(-2)
         terms = torch.where(observed.unsqueeze(-2), z.square(), 0).sum(-1)
         constant = torch.where(observed, 2 * deviation.log() + math.log(2 * math.pi), 0).sum(-1, keepdim=True)
         joint = state.log_weights - 0.5 * (terms + constant)
@@ -181,19 +186,20 @@ def particle_filter(
     weight_noise: float | None = None,
     context: Basis | None = None,
     softness: float = 0.0,
+    robust: RobustWeights | None = None,
 ) -> ParticleFilter:
     """The paper's PF: particles are demonstrations, systematic resampling where N_eff < E/2.
 
     Args:
         primitive: of the demonstrations.
         n_members: E; default: N, each demonstration once. Otherwise they are drawn with replacement.
-        residual_variance, weight_noise, context: see `interaction_model`.
+        residual_variance, weight_noise, context, robust: see `interaction_model`.
         softness: of the resampling, see `ParticleFilter`; needed for gradients through it.
 
     Returns:
         A filter with parameters of its own, in the dtype and on the device of the primitive.
     """
-    model = interaction_model(primitive, residual_variance, weight_noise, context)
+    model = interaction_model(primitive, residual_variance, weight_noise, context, robust)
     return ParticleFilter(
         model.dynamics,
         model.observation,

@@ -129,14 +129,16 @@ class Plan:
             deviance = sum(map(math.log, diagonal.tolist())) + 0.5 * deviance if finite else math.nan
             likelihood = torch.sub(self.constant, self.one, alpha=deviance)
         if not finite:
-            infinite = ~self.values.isfinite() if seen is None else ~self.values.isfinite() & seen[..., 0]
-            if not bool(infinite.any()):
-                raise ValueError(
-                    "the likelihood of a sample is not finite: the members are not, or y is out of range"
-                )
+            self.check_finite(seen)
+            raise ValueError("the likelihood of a sample is not finite: the members are not, or y is out of range")
+        return likelihood
+
+    def check_finite(self, seen: Tensor | None) -> None:
+        """Raise ValueError if a value that was measured, bool [B, K, 1], is NaN or infinite."""
+        infinite = ~self.values.isfinite() if seen is None else ~self.values.isfinite() & seen[..., 0]
+        if bool(infinite.any()):
             bad = self.dofs[infinite.reshape(-1, len(self.dofs)).any(0)].tolist()
             raise ValueError(f"y is NaN or infinite where it is observed, in DoFs {bad[:8]}; mark it False there")
-        return likelihood
 
     @staticmethod
     def without(seen: Tensor, deviation: Tensor, R: Tensor) -> tuple[Tensor, Tensor]:
