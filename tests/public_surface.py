@@ -30,8 +30,7 @@ SYNTAX = {"__len__", "__getitem__", "__iter__", "__enter__"}
 
 def surface() -> str:
     """The listing: a heading for each module, a line for each name, its members below it."""
-    modules = [torch_ebip, *(importlib.import_module(name) for name in _module_names())]
-    listed = {name: _public(module) for name, module in ((module.__name__, module) for module in modules)}
+    listed = public_names()
     # An object is described once: in the module nearest to its definition.
     home = {id(thing): module for module, things in listed.items() for thing in things.values() if _is_code(thing)}
     lines = []
@@ -48,9 +47,13 @@ def surface() -> str:
     return "\n".join(lines).strip() + "\n"
 
 
-def _module_names() -> list[str]:
-    """Subpackages and modules one level down; what lies deeper is public only where a subpackage exports it."""
-    return sorted(f"torch_ebip.{module.name}" for module in pkgutil.iter_modules(torch_ebip.__path__))
+def public_names() -> dict[str, dict[str, Any]]:
+    """What is public, by module and name: of the package, and of subpackages and modules one level down.
+
+    What lies deeper is public only where a subpackage exports it.
+    """
+    names = sorted(f"torch_ebip.{module.name}" for module in pkgutil.iter_modules(torch_ebip.__path__))
+    return {name: _public(importlib.import_module(name)) for name in ["torch_ebip", *names]}
 
 
 def _public(module: types.ModuleType) -> dict[str, Any]:

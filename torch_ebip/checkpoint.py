@@ -31,6 +31,10 @@ def save_checkpoint(
 def load_checkpoint(path: str | os.PathLike[str], configuration: Mapping[str, Any]) -> dict[str, Any]:
     """Read the content of a checkpoint; executes nothing of it.
 
+    Args:
+        path: of the file.
+        configuration: of this run; what the checkpoint was written with must be equal to it.
+
     Raises:
         FileNotFoundError: there is none.
         ValueError: the file is cut off or not a checkpoint, or it was written with another configuration;

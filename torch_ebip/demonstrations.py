@@ -79,7 +79,7 @@ class Demonstrations:
         return (self.lengths.to(dtype) - 1) / self.rate
 
     def subset(self, indices: Sequence[int] | Tensor) -> Demonstrations:
-        """The demonstrations at these indices, with their columns; ValueError if an index is out of range."""
+        """The demonstrations at these indices [M], with their columns; ValueError if an index is out of range."""
         chosen = [int(i) for i in indices]
         outside = [i for i in chosen if not -len(self) <= i < len(self)]
         if outside:
@@ -88,7 +88,11 @@ class Demonstrations:
         return Demonstrations(self.layout, [self.trajectories[i] for i in chosen], self.rate, columns)
 
     def folds(self, k: int, generator: torch.Generator | None = None) -> list[tuple[Tensor, Tensor]]:
-        """Shuffle once and cut into k parts: [(training indices, test indices)], sizes differing by at most one.
+        """Shuffle once and cut into k parts: (training, test) indices int64 [M], sizes differing by at most one.
+
+        Args:
+            k: how many folds.
+            generator: of the shuffle.
 
         Raises:
             ValueError: k is not between 2 and the number of demonstrations.

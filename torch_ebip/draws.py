@@ -67,7 +67,12 @@ def seeded(*numbers: int) -> torch.Generator:
 
 
 def replayed(generator: Generators, states: Sequence[Tensor] | None = None) -> Generators:
-    """New generators that will make the draws that these would make now, or that they made from some states on."""
+    """New generators that will make the draws that ``generator`` would make now, or made from some states on.
+
+    Args:
+        generator: one, several or none; not changed.
+        states: [bytes] each, as `states_of` gives them; default: the present ones.
+    """
     if generator is None:
         return None
     if isinstance(generator, torch.Generator):
@@ -77,14 +82,14 @@ def replayed(generator: Generators, states: Sequence[Tensor] | None = None) -> G
 
 
 def states_of(generator: Generators) -> list[Tensor]:
-    """The state of each generator."""
+    """The state of each generator, uint8 [bytes]; none for torch's global one."""
     if generator is None:
         return []
     return [one.get_state() for one in ([generator] if isinstance(generator, torch.Generator) else generator)]
 
 
 def set_states(generator: Generators, states: Sequence[Tensor]) -> None:
-    """Bring generators to some states."""
+    """Bring every generator to its own of some states, uint8 [bytes], as `states_of` gave them."""
     if generator is not None:
         several = [generator] if isinstance(generator, torch.Generator) else generator
         for one, state in zip(several, states, strict=True):

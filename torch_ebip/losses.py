@@ -33,7 +33,7 @@ class TrajectoryLoss(nn.Module):
         self.register_buffer("dofs", dofs)
 
     def forward(self, predicted: Tensor, target: Tensor) -> Tensor:
-        """Predicted and target [..., D] (any phases and batches in front) -> scalar, without unit."""
+        """From predicted and target [..., D] (phases and batches in front), units of the DoFs: unitless scalar."""
         predicted, target, measured = self._scaled(predicted, target)
         return (predicted - target).square().mul(measured).sum() / measured.sum().clamp(min=1)
 
@@ -48,7 +48,16 @@ class CRPSLoss(TrajectoryLoss):
     """Mean fair CRPS of an ensemble forecast in units of each DoF's scale; arguments as `TrajectoryLoss`."""
 
     def forward(self, predicted: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
-        """Members [..., E, D], target [..., D] and weights [..., E] (default: equal) -> scalar, without unit."""
+        """Mean over all that was measured.
+
+        Args:
+            predicted: members [..., E, D], units of the DoFs.
+            target: [..., D], units of the DoFs; NaN where not measured.
+            weights: of the members, [..., E], summing to 1; default: equal.
+
+        Returns:
+            scalar, without unit.
+        """
         members, target, measured = self._scaled(predicted, target)
         return crps(members, target, weights).mul(measured).sum() / measured.sum().clamp(min=1)
 
@@ -60,7 +69,7 @@ class EnergyScoreLoss(TrajectoryLoss):
     """
 
     def forward(self, predicted: Tensor, target: Tensor) -> Tensor:
-        """Members [..., E, D] and target [..., D] -> scalar, without unit."""
+        """From predicted members [..., E, D] and target [..., D], units of the DoFs: scalar, without unit."""
         members, target, measured = self._scaled(predicted, target)
         members = torch.where(measured.unsqueeze(-2), members, 0)
         return energy_score(members, target).mean()
@@ -73,7 +82,7 @@ class InnovationLikelihoodLoss(nn.Module):
     """
 
     def forward(self, log_likelihood: Tensor, observed: Tensor) -> Tensor:
-        """Log-likelihoods [..., T] and observed bool [..., T, D] -> scalar, nats a measured value."""
+        """From log_likelihood [..., T] and observed, bool [..., T, D]: scalar, nats a measured value."""
         return -log_likelihood.sum() / observed.sum().clamp(min=1)
 
 
@@ -93,7 +102,15 @@ class ForwardKinematicsLoss(nn.Module):
         self.rotation_weight = rotation_weight
 
     def forward(self, predicted_joints: Tensor, target_joints: Tensor) -> Tensor:
-        """Joints [..., 6] rad, both -> scalar, metres; rows with NaN in the target are left out."""
+        """Mean over all rows but those with NaN in the target.
+
+        Args:
+            predicted_joints: [..., n_joints], rad.
+            target_joints: [..., n_joints], rad.
+
+        Returns:
+            scalar, metres.
+        """
         measured = ~target_joints.isnan().any(-1)
         predicted = self.arm(predicted_joints)
         target = self.arm(torch.where(measured.unsqueeze(-1), target_joints, 0))

@@ -23,7 +23,15 @@ def mae(forecast: Forecast, target: Tensor) -> Tensor:
 
 
 def coverage_95(forecast: Forecast, target: Tensor) -> Tensor:
-    """Share of the DoFs whose target lies in mean +- 1.96 deviations: [..., D] -> [...]; 0.95 would be right."""
+    """Share of the DoFs whose target lies in mean +- 1.96 deviations; 0.95 would be right.
+
+    Args:
+        forecast: [..., D].
+        target: [..., D], units of the DoFs.
+
+    Returns:
+        [...], without unit.
+    """
     inside = (forecast.mean - target).abs() <= Z95 * forecast.variance.sqrt()
     unknown = target.isnan() | forecast.mean.isnan()
     return inside.to(target.dtype).where(~unknown, torch.nan).nanmean(-1)
@@ -35,11 +43,20 @@ def crps(forecast: Forecast, target: Tensor) -> Tensor:
 
 
 def phase_error(phase: Tensor, true_phase: Tensor) -> Tensor:
-    """Absolute error of the inferred phase, [...] each -> [...]."""
+    """Absolute error of the inferred phase: phase [...], true_phase [...] -> [...]."""
     return (phase - true_phase).abs()
 
 
 def tool_error(arm: RobotArm, joints: Tensor, target_joints: Tensor) -> Tensor:
-    """Distance of the tool from where it should be, joints [..., n_joints] rad -> [...], metres."""
+    """Distance of the tool from where it should be.
+
+    Args:
+        arm: whose tool it is.
+        joints: [..., n_joints], rad.
+        target_joints: [..., n_joints], rad.
+
+    Returns:
+        [...], metres.
+    """
     distance: Tensor = (arm(joints)[..., :3, 3] - arm(target_joints)[..., :3, 3]).norm(dim=-1)
     return distance

@@ -40,16 +40,16 @@ class Monitor:
         self.close()
 
     def scalars(self, values: Mapping[str, float], step: int) -> None:
-        """One point for each name; a slash in a name groups them."""
+        """One point at this step for each of some values; a slash in a name groups them."""
         for name, value in values.items():
             self._writer.add_scalar(name, value, step)
 
     def text(self, name: str, markdown: str) -> None:
-        """A text tab, in Markdown."""
+        """A text tab of this name, written in markdown."""
         self._writer.add_text(name, markdown)
 
     def figure(self, name: str, figure: Figure, step: int) -> None:
-        """A matplotlib figure, which is closed."""
+        """A matplotlib figure of this name and step, which is closed."""
         self._writer.add_figure(name, figure, step, close=True)
 
     def hyperparameters(self, settings: Mapping[str, Any], metrics: Mapping[str, float]) -> None:
@@ -58,7 +58,7 @@ class Monitor:
         self._writer.add_hparams(plain, dict(metrics), run_name=".")
 
     def filter(self, filter: nn.Module, layout: Layout, step: int) -> None:
-        """The constrained noise of a filter: see `noise_scalars`."""
+        """The constrained noise of a filter on a layout, at this step: see `noise_scalars`."""
         self.scalars(noise_scalars(filter, layout), step)
 
     def close(self) -> None:
@@ -67,7 +67,7 @@ class Monitor:
 
 
 def noise_scalars(filter: nn.Module, layout: Layout) -> dict[str, float]:
-    """Constrained values of everything a filter can learn, by name.
+    """Constrained values of everything a filter on a layout can learn, by name.
 
     - ``R/MODALITY``: geometric mean over its DoFs of the standard deviation, in its unit, and ``R_factor/DOF``
       the variance relative to the start;

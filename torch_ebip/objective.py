@@ -109,13 +109,22 @@ class ForecastObjective(nn.Module):
         return terms
 
     def phases_ahead(self, now: Tensor) -> Tensor:
-        """Phases [..., P] that are scored from horizons now [...]."""
+        """Phases [..., P] that are scored from the phases now [...] of the horizons."""
         return now.unsqueeze(-1) + (1 - now.unsqueeze(-1)) * self.phases
 
     def spread_and_error(self, filter: Filter, trace: Trace, truth: Tensor, targets: Tensor) -> Tensor:
         """[2]: root mean variance of the forecasts of phase 1 and root mean squared error of their mean.
 
         Both in units of the targets' spread over the demonstrations; equal for a calibrated filter.
+
+        Args:
+            filter: that made the trace.
+            trace: with states kept at K horizons, batch [B].
+            truth: [B, K, P, D_targets], the last of the P phases being 1.
+            targets: bool [D'], the targets among the filter's DoFs.
+
+        Raises:
+            ValueError: the trace kept no states.
         """
         if trace.kept is None:
             raise ValueError("the trace kept no states to forecast from")

@@ -73,7 +73,7 @@ class Ranks:
         return list(items[self.rank :: self.size])
 
     def mean(self, values: Mapping[str, float], weight: float) -> dict[str, float]:
-        """Weighted mean over the processes of each of some values; the same names everywhere.
+        """Mean over the processes of each of some values, with the weight of each process; the same names everywhere.
 
         Raises:
             RankLostError: another process ended.
@@ -85,7 +85,7 @@ class Ranks:
         return dict(zip(values, (numbers[:-1] / numbers[-1]).tolist(), strict=True))
 
     def add_up(self, tensors: Sequence[Tensor]) -> None:
-        """Replace each tensor by its sum over the processes, in one message.
+        """Replace each tensor [...] by its sum over the processes, in one message.
 
         Raises:
             RankLostError: another process ended.

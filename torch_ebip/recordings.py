@@ -30,7 +30,7 @@ _REQUIRED = ("values", "lengths", "rate", "dofs", "modality", "unit", "controlle
 
 
 class Recordings(NamedTuple):
-    """What a file holds: the layout, one array [T_i, D] a demonstration, the rate in Hz, extra columns [N]."""
+    """What a file holds: layout, one of the trajectories [T_i, D] a demonstration, rate in Hz, extra columns [N]."""
 
     layout: Layout
     trajectories: list[Array]
@@ -39,7 +39,7 @@ class Recordings(NamedTuple):
 
 
 def write_npz(path: str | os.PathLike[str], recordings: Recordings) -> None:
-    """Write recordings to one compressed ``.npz``; atomic, never pickled."""
+    """Write recordings to one compressed ``.npz`` at a path; atomic, never pickled."""
     layout = recordings.layout
     arrays: dict[str, Array] = {
         "values": np.concatenate(recordings.trajectories).astype(np.float32),

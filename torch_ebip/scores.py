@@ -15,7 +15,7 @@ def crps(members: Tensor, target: Tensor, weights: Tensor | None = None, fair: b
 
     Args:
         members: [..., E, D], E >= 2.
-        target: [..., D].
+        target: [..., D], units of the DoFs.
         weights: of the members, [..., E], summing to 1; default: equal.
         fair: without it the last divisor is 2, the score of the members as a distribution of their own.
 
@@ -43,7 +43,7 @@ def gaussian_crps(mean: Tensor, variance: Tensor, target: Tensor) -> Tensor:
     Args:
         mean: [..., D].
         variance: [..., D], squared units; where it is 0 the score is the absolute error.
-        target: [..., D].
+        target: [..., D], units of the DoFs.
 
     Returns:
         [..., D], units of the DoFs; smaller is better.
@@ -61,7 +61,7 @@ def energy_score(members: Tensor, target: Tensor) -> Tensor:
 
     Args:
         members: [..., E, D], E >= 2, in comparable units.
-        target: [..., D].
+        target: [..., D], in those units.
 
     Returns:
         [...], in those units; smaller is better.

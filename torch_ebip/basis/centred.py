@@ -46,11 +46,11 @@ class CentredBasis(Basis):
 
     @abstractmethod
     def curve(self, distance: Tensor) -> Tensor:
-        """The curve at distances from its centre, in units of ``stretch`` widths, of their shape."""
+        """The curve [...] at distances [...] from its centre, in units of ``stretch`` widths."""
 
     @abstractmethod
     def slope(self, distance: Tensor, values: Tensor) -> Tensor:
-        """Its derivative, where its values are known already."""
+        """Its derivative [...] by the distance [...], where its values [...] there are known already."""
 
     def evaluate(self, phase: Tensor) -> tuple[Tensor, Tensor]:
         """Values and slopes; see `Basis.evaluate`."""

@@ -136,7 +136,7 @@ def _fit(layout: Layout, basis: Basis, samples: Samples) -> list[CandidateFit]:
 
 
 def selection_table(rows: Sequence[CandidateFit], best: int = 3) -> str:
-    """The first rows of each modality as text, errors in the modality's unit."""
+    """The first ``best`` rows of each modality as text, errors in the modality's unit."""
     lines = [f"{'modality':<20} {'basis':<58} {'BIC':>12} {'rmse':>10} {'start':>10} {'end':>10} unit"]
     seen: dict[str, int] = {}
     for row in rows:

@@ -159,7 +159,13 @@ class Filter(nn.Module, ABC):
         return "weights have process noise" if getattr(self.noise.process, "weights", None) is not None else None
 
     def predict(self, state: State, dt: float | Tensor, generator: Generators = None) -> State:
-        """Propagate by dt seconds: a number, or a tensor [...] with one for each entry of the batch."""
+        """Propagate.
+
+        Args:
+            state: of this filter.
+            dt: seconds: a number, or a tensor [...] with one for each entry of the batch.
+            generator: of the draws.
+        """
         return self._predict(state, torch.as_tensor(dt, dtype=state[0].dtype, device=state[0].device), generator)
 
     def update(

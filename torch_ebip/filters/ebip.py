@@ -37,7 +37,7 @@ def ebip(
     Args:
         primitive: of the demonstrations.
         n_members: E; default: N, each demonstration once. Otherwise members are drawn with replacement.
-        residual_variance: [D], R at the start; default: the paper's closed form. The corrected one is
+        residual_variance: [D], R at the start, squared units; default: the paper's closed form. The corrected one is
             ``primitive.correlated_residual_variance``.
         weight_noise: rate of the weights' random walk at the start, 1/sqrt(s); see `WeightNoise`.
         context: functions of phase for an R that depends on it; see `MeasurementNoise`.

@@ -93,7 +93,7 @@ class EvidenceWeighting(nn.Module):
         return Evidence(misfit + 1 / E, misfit, misfit.sum(-1), members[..., 2:])
 
     def forget(self, evidence: Evidence, dt: Tensor) -> Evidence:
-        """Discount the past over dt [...] seconds."""
+        """Discount the past of some evidence over dt [...] seconds."""
         keep = torch.exp(-self.forgetting.value * dt)
         return evidence._replace(misfit=evidence.misfit * keep.unsqueeze(-1), seen=evidence.seen * keep)
 
@@ -113,7 +113,7 @@ class EvidenceWeighting(nn.Module):
             evidence: so far.
             projections: [..., E, O, D], of the demonstrations (`Evidence.origin`) at the members' phases +
                 `offsets`.
-            y: [..., D]; ignored where not observed.
+            y: [..., D], units of the DoFs; ignored where not observed.
             observed: bool [..., D].
             phase: [...], mean phase.
             columns: int64 [D], which of this module's DoFs these are; default: all.

@@ -70,7 +70,7 @@ class ExtendedFilter(Filter):
         members: Tensor | None = None,
         generator: Generators = None,
     ) -> GaussianState:
-        """The equations of mu_0 and Sigma_0, of all demonstrations or of those named; see `Filter`."""
+        """The equations of mu_0 and Sigma_0, of all demonstrations or of those named; see `Filter.initial_state`."""
         return GaussianState(*self.prior(batch_shape, members))
 
     def _predict(self, state: GaussianState, dt: Tensor, generator: Generators) -> GaussianState:

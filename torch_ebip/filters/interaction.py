@@ -40,7 +40,7 @@ class ConstantVelocityPhase(nn.Module):
         self.overrun = overrun
 
     def forward(self, members: Tensor, dt: Tensor) -> Tensor:
-        """Members [..., E, n] after dt [...] seconds."""
+        """The members [..., E, n] after dt [...] seconds."""
         # A copy with one column exchanged costs a third of putting columns together.
         moved = members.clone()
         moved[..., 0] = self.hold(members[..., 0] + members[..., 1] * dt[..., None])
@@ -53,7 +53,7 @@ class ConstantVelocityPhase(nn.Module):
         return torch.addcdiv(inside, excess, excess.abs() + self.overrun, value=self.overrun)
 
     def slope(self, mean: Tensor, dt: Tensor) -> Tensor:
-        """Derivative [...] of the next phase by the present one at states [..., n]: 1 within the interval."""
+        """Derivative [...] of the phase in dt [...] seconds by that of the mean [..., n]: 1 within the interval."""
         phase = mean[..., 0] + mean[..., 1] * dt
         excess = (phase - phase.clamp(0, 1)).abs()
         return (1 + excess / self.overrun).pow(-2)
@@ -75,7 +75,7 @@ class BasisProjection(nn.Module):
         return self.rows(members, None)
 
     def rows(self, members: Tensor, dofs: Sequence[int] | None) -> Tensor:
-        """Projections [..., E, k] of some DoFs (ascending indices; None for all)."""
+        """Projections [..., E, k] of members [..., E, n], of some dofs (ascending indices; None for all)."""
         phase, _, weights = split_state(members)
         return self.basis.project(phase.squeeze(-1), weights, dofs)
 
@@ -105,5 +105,5 @@ class BasisProjection(nn.Module):
         return members[..., 0]
 
     def at(self, members: Tensor, phase: Tensor) -> Tensor:
-        """Projections [..., P, E, D] of members [..., E, n] at phases [..., P] that all of them share."""
+        """Projections [..., P, E, D] of members [..., E, n] at points of phase [..., P] that all of them share."""
         return self.basis.project_paths(phase.unsqueeze(-2), members[..., 2:]).transpose(-2, -3)

@@ -34,7 +34,13 @@ if TYPE_CHECKING:
 
 
 class LiveSnapshot(NamedTuple):
-    """What `LiveFilter.save` keeps: members, evidence (never changed in place), states of the generators."""
+    """What `LiveFilter.save` keeps.
+
+    Attributes:
+        matrix: the members, [..., m, E], as `SpanMembers` has them.
+        evidence: for demonstrations; never changed in place.
+        generators: their states, uint8 [bytes] each.
+    """
 
     matrix: Tensor
     evidence: Evidence | None
@@ -166,7 +172,7 @@ class LiveFilter:
 
     @torch.no_grad()
     def forecast(self, phase: Tensor | None = None, dofs: Tensor | None = None) -> Forecast:
-        """See `Filter.forecast`; of the DoFs bool [D] only, if given, which costs less than all."""
+        """See `Filter.forecast`; of some dofs only, bool [D], if given, which costs less than all."""
         if dofs is not None and (dofs.shape != (self.filter.n_dofs,) or dofs.dtype != torch.bool):
             raise ValueError(f"dofs must be bool [{self.filter.n_dofs}], got {dofs.dtype} {list(dofs.shape)}")
         chosen = (True,) * self.filter.n_dofs if dofs is None else tuple(dofs.tolist())
@@ -219,7 +225,7 @@ class LiveFilter:
         """`update` with arguments that were checked.
 
         Args:
-            y: [..., D].
+            y: [..., D], units of the DoFs.
             measured: D, which DoFs some entry of the batch measured.
             mask: bool [B, D], which of them each entry did; None if all did.
         """

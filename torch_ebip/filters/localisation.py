@@ -36,7 +36,7 @@ class Localisation(nn.Module):
         self.loadings = Positive(start * own + 0.1 * start * (1 - own))
 
     def select(self, state: Tensor, dofs: Tensor) -> Localisation:
-        """The same factors, with the same parameters, for some entries of state and observation (int64)."""
+        """The same factors, with the same parameters, for some entries of state int64 [k] and dofs int64 [m]."""
         part = Localisation(self.names, self.state_block[state], self.dof_block[dofs])
         part.loadings = self.loadings
         return part

@@ -118,7 +118,7 @@ class MemberFilter(Filter):
         return functional.ensemble_mean(phase_of(state.members).unsqueeze(-1), state.weights).squeeze(-1)
 
     def forecast_members(self, state: State, phase: Tensor) -> Tensor:
-        """Each member's trajectory, [..., P, E, D], at phases [P] or [..., P].
+        """Each member's trajectory, [..., P, E, D], that a state implies at a phase [P] or [..., P].
 
         Raises:
             TypeError: the observation knows no phase.

@@ -52,7 +52,7 @@ def interaction_model(
 
     Args:
         primitive: of the demonstrations.
-        residual_variance: [D], R at the start; default: the paper's closed form. The corrected one is
+        residual_variance: [D], R at the start, squared units; default: the paper's closed form. The corrected one is
             ``primitive.correlated_residual_variance``.
         weight_noise: rate of the weights' random walk at the start, 1/sqrt(s), see `WeightNoise`; default: none.
         context: functions of phase for an R that depends on it; see `MeasurementNoise`.

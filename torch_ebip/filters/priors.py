@@ -160,7 +160,14 @@ class GaussianPrior(nn.Module):
         members: Tensor | None = None,
         generator: Generators = None,
     ) -> Tensor:
-        """Independent draws [*batch_shape, E, n]; ``members`` must be None."""
+        """Independent draws [*batch_shape, E, n].
+
+        Args:
+            batch_shape: leading dimensions.
+            n_members: E.
+            members: int64 [..., E] where a prior has demonstrations; this one has none, so None.
+            generator: of the draws.
+        """
         if members is not None:
             raise ValueError("a Gaussian prior has no demonstrations to choose members from")
         shape = (*batch_shape, n_members, len(self.mean))

@@ -17,7 +17,7 @@ State = Any
 
 
 class Segment(NamedTuple):
-    """What some samples leave: the state after the last one, and a list entry a sample."""
+    """What some samples leave: the state after the last one, and an entry a sample: [...], [...] and [..., D]."""
 
     state: State
     phase: list[Tensor]
@@ -73,7 +73,7 @@ def assemble(picked: list[tuple[tuple[int, ...], State]], shape: torch.Size) -> 
 
 
 def map_state(function: Callable[..., Tensor], *states: State) -> State:
-    """Apply a function to the corresponding tensors of states, which may be nested and hold None."""
+    """Apply a function to the corresponding tensors [...] of states, which may be nested and hold None."""
     first = states[0]
     if first is None:
         return None

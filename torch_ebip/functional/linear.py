@@ -7,7 +7,12 @@ from torch import Tensor
 
 
 class FactorisationError(ValueError):
-    """A covariance of observations that is not positive definite; ``dofs`` are the first failing columns."""
+    """A covariance of observations that is not positive definite.
+
+    Args:
+        message: what to say of it.
+        dofs: the first failing columns.
+    """
 
     def __init__(self, message: str, dofs: list[int]) -> None:
         super().__init__(message)
@@ -18,7 +23,7 @@ def cholesky(matrix: Tensor, rows: Tensor | None = None) -> Tensor:
     """Lower Cholesky factor of covariances [..., D, D] of observations, or an error that says what to do.
 
     Args:
-        matrix: symmetric positive definite.
+        matrix: [..., D, D], symmetric positive definite.
         rows: int64 [D], which DoFs these are, for the error; default: the first D.
 
     Raises:

@@ -13,7 +13,7 @@ def ensemble_mean(members: Tensor, weights: Tensor | None = None) -> Tensor:
 def ensemble_variance(members: Tensor, weights: Tensor | None = None, unbiased: bool = True) -> Tensor:
     """Variance [..., n] of members [..., E, n] with weights [..., E]; default: equal ones.
 
-    Unbiased for members that are draws; otherwise that of the members as a distribution of their own.
+    With ``unbiased`` for members that are draws; without, that of the members as a distribution of their own.
     """
     anomalies = members - ensemble_mean(members, weights).unsqueeze(-2)
     return (anomalies.square() * member_shares(members, weights, unbiased)).sum(-2)

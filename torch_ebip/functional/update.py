@@ -65,7 +65,7 @@ def ensemble_update(
     Args:
         members: X, [..., E, n], E >= 2.
         projections: HX, [..., E, D].
-        y: measurement, [..., D]; ignored (it may be NaN) where not observed.
+        y: measurement, [..., D], units of the DoFs; ignored (it may be NaN) where not observed.
         noise_cholesky: lower Cholesky factor of R, [..., D, D].
         perturbations: standard-normal draws, [..., E, D]; scaled inside by the Cholesky factor.
         observed: bool [..., D]; default: everything.

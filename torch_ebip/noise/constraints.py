@@ -16,7 +16,7 @@ class Constrained(nn.Module, ABC):
     """A learnable value with a starting point and a constraint.
 
     Args:
-        start: the value at the beginning, any shape, inside the constraint.
+        start: the value at the beginning, [...], inside the constraint.
 
     Attributes:
         raw: the parameter that is optimised; zeros at the start.
@@ -40,14 +40,14 @@ class Constrained(nn.Module, ABC):
     @property
     @abstractmethod
     def value(self) -> Tensor:
-        """The constrained value, shape of `start`."""
+        """The constrained value [...], shape of `start`."""
 
 
 class Positive(Constrained):
     """A positive scale: start * (floor + (1 - floor) exp(raw)), never below ``floor`` times the start.
 
     Args:
-        start: positive values.
+        start: positive values, [...].
         floor: smallest fraction of the start.
     """
 
@@ -62,7 +62,7 @@ class Positive(Constrained):
 
     @property
     def value(self) -> Tensor:
-        """Positive values, shape of `start`."""
+        """Positive values [...], shape of `start`."""
         return self.start * (self.floor + (1 - self.floor) * self.raw.exp())
 
 
@@ -76,5 +76,5 @@ class AboveOne(Constrained):
 
     @property
     def value(self) -> Tensor:
-        """Factors above 1, shape of `start`."""
+        """Factors above 1, [...], shape of `start`."""
         return 1 + (self.start - 1) * self.raw.exp()

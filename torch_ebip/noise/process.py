@@ -15,7 +15,7 @@ class NoProcessNoise(nn.Module):
     """Q = 0, for dynamics that bring their own noise or need none."""
 
     def forward(self, members: Tensor, dt: Tensor, generator: Generators = None) -> Tensor:
-        """The members [..., E, n] as they are."""
+        """The members [..., E, n] as they are, whatever dt, in seconds, and generator."""
         return members
 
 
@@ -28,7 +28,7 @@ class PhaseNoise(nn.Module):
     three numbers learned. They start at sigma, 1 and 0.01, the model to 1 part in 10^4.
 
     Args:
-        acceleration: sigma at the start, 1/s^2; one number.
+        acceleration: scalar, sigma at the start, 1/s^2.
     """
 
     def __init__(self, acceleration: Tensor) -> None:
@@ -72,7 +72,7 @@ class WeightNoise(nn.Module):
         self.register_buffer("modality_of_weight", modality_of_weight)
 
     def scale(self, dt: Tensor) -> Tensor:
-        """Standard deviation of the step of each weight, [..., n_weights] for dt [...]."""
+        """Standard deviation of the step of each weight, [..., n_weights] for dt [...] seconds."""
         rate = self.rates.value[self.modality_of_weight] * self.deviation
         return rate * dt.sqrt().unsqueeze(-1)
 
@@ -86,7 +86,7 @@ class InteractionNoise(nn.Module):
     Args:
         phase: noise of the first two entries.
         weights: noise of the others; default none, so that members stay in the span of the demonstrations.
-        columns: int64, which entries of ``weights`` the state holds; default all of them.
+        columns: int64 [k], which entries of ``weights`` the state holds; default all of them.
         thinning: how many steps each one stands for.
     """
 
@@ -106,7 +106,12 @@ class InteractionNoise(nn.Module):
         self.register_buffer("columns", columns)
 
     def select(self, columns: Tensor, thinning: int = 1) -> InteractionNoise:
-        """The same noise, with the same parameters, for a state with some of the weights, int64 [k]."""
+        """The same noise, with the same parameters, for a state with some of the weights.
+
+        Args:
+            columns: int64 [k], which of them.
+            thinning: how many steps each one stands for, on top of the present ones.
+        """
         columns = columns if self.columns is None else self.columns[columns]
         return InteractionNoise(self.phase, self.weights, columns, thinning * self.thinning)
 
@@ -131,11 +136,20 @@ class InteractionNoise(nn.Module):
         return scale if self.columns is None else scale[..., self.columns]
 
     def forward(self, members: Tensor, dt: Tensor, generator: Generators = None) -> Tensor:
-        """Members [..., E, n] with noise for steps dt [...] seconds added."""
+        """The members with noise added.
+
+        Args:
+            members: [..., E, n].
+            dt: [...], seconds of the step.
+            generator: of the draws.
+
+        Returns:
+            [..., E, n].
+        """
         return self.add_(members.clone(), dt, generator)
 
     def add_(self, members: Tensor, dt: Tensor, generator: Generators = None) -> Tensor:
-        """The same in place, for members that nobody else holds."""
+        """The same in place, for members that nobody else holds: see `InteractionNoise.forward`."""
         factor = self.phase_factor(dt).transpose(-1, -2)
         members[..., :2] += standard_normal(members[..., :2].shape, members, generator) @ factor
         scale = self._weight_scale(dt)

@@ -59,7 +59,14 @@ class TuningSettings:
 
 
 class TuningResult(NamedTuple):
-    """How a tuning went: the step whose parameters were kept, validation loss by step, why it ended."""
+    """How a tuning went.
+
+    Attributes:
+        best_step: whose parameters were kept.
+        validation: the loss by step.
+        stopped_early: whether patience ended before the steps did.
+        seconds: that it took.
+    """
 
     best_step: int
     validation: dict[int, float]
