@@ -92,6 +92,8 @@ def test_pickles_are_refused_and_not_run(tmp_path: Path, demonstrations: Demonst
     ("change", "message"),
     [
         ({"lengths": np.array([3, 4])}, "lengths add up to 7"),
+        ({"lengths": np.array([3.0, 4.0])}, "lengths must be counts"),
+        ({"lengths": np.array([-3, 4])}, "lengths must be counts"),
         ({"rate": np.float64(-1)}, "rate must be a positive"),
         ({"rate": np.array([1.0, 2.0])}, "rate must be one number"),
         ({"unit": np.array(["m"])}, r"unit has shape \(1,\), expected \(5,\)"),
@@ -137,6 +139,16 @@ def test_a_missing_array_is_named(tmp_path: Path) -> None:
 def test_what_makes_no_demonstrations(trajectories: list, rate: float, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Demonstrations(layout(), trajectories, rate)
+
+
+def test_columns_have_a_row_a_demonstration_and_names_of_their_own(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"column 'release' has shape \(3,\), expected 2 rows"):
+        Demonstrations(layout(), [torch.zeros(4, 5)] * 2, 30.0, {"release": np.zeros(3)})
+    for name in ("values", "file"):
+        odd = Demonstrations(layout(), [torch.zeros(4, 5)] * 2, 30.0, {name: np.zeros(2)})
+        with pytest.raises(ValueError, match=f"column '{name}' has the name of a part of the format"):
+            odd.save(tmp_path / "odd.npz")
+    assert not list(tmp_path.iterdir())
 
 
 def test_objects_are_not_saved(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.conftest import small_primitive
 from tests.test_tuning import filter_and_tuner
 from torch_ebip import ebip
 from torch_ebip.monitor import Monitor, noise_scalars
@@ -104,3 +105,17 @@ def test_the_tails_of_a_robust_filter_are_logged() -> None:
     _, tuner = filter_and_tuner()
     values = noise_scalars(ebip(tuner.primitive, robust=StudentT(3.0)), tuner.layout)
     assert values["R_robust/StudentT"] == pytest.approx(3.0)
+
+
+def test_what_is_learned_beside_r_is_logged() -> None:
+    primitive = small_primitive()
+    made = ebip(primitive, localise=True, weight_noise=0.2)
+    values = noise_scalars(made, primitive.layout)
+    assert {name for name in values if name.startswith("Q/weights/")} == {
+        f"Q/weights/{name}" for name in primitive.layout.names
+    }
+    assert values["Q/weights/arm"] == pytest.approx(0.2)
+    matrix = made.localisation.matrix.detach()
+    for i, j, name in ((0, 1, "hand~gaze"), (0, 2, "hand~arm"), (1, 2, "gaze~arm")):
+        assert values[f"localisation/{name}"] == pytest.approx(float(matrix[i, j]))
+    assert not any(name.startswith("R_phase") for name in values)  # R does not depend on phase here

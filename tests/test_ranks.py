@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from torch_ebip.draws import seeded
-from torch_ebip.ranks import Ranks
+from torch_ebip.ranks import RankLostError, Ranks
 
 ROOT = Path(__file__).parents[1]
 
@@ -92,3 +92,32 @@ def test_seeds_of_neighbours_share_no_stream() -> None:
     draws = {tuple(torch.rand(2, generator=seeded(*key)).tolist()) for key in keys}
     assert len(draws) == 18
     assert torch.equal(torch.rand(2, generator=seeded(1, 2)), torch.rand(2, generator=seeded(1, 2)))
+
+
+def test_what_the_first_process_cannot_make_ends_all_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    wire: list = []
+
+    def broadcast(made: list) -> None:
+        if made != [None, None]:
+            wire[:] = made
+        made[:] = wire
+
+    def fail() -> int:
+        raise ValueError("no such file")
+
+    monkeypatch.setattr(torch.distributed, "broadcast_object_list", broadcast)
+    with pytest.raises(ValueError, match="no such file"):
+        Ranks(0, 2).from_first(fail)
+    with pytest.raises(SystemExit, match="the first process stopped"):
+        Ranks(1, 2).from_first(lambda: pytest.fail("only the first one makes it"))
+    assert Ranks(0, 2).from_first(lambda: 7) == Ranks(1, 2).from_first(lambda: 8) == 7
+
+
+def test_a_broken_connection_is_a_lost_rank(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise RuntimeError("connection closed by peer")
+
+    monkeypatch.setattr(torch.distributed, "all_reduce", broken)
+    for talk in (lambda: Ranks(0, 2).add_up([torch.ones(3)]), lambda: Ranks(1, 2).mean({"a": 1.0}, 1.0)):
+        with pytest.raises(RankLostError, match="connection closed by peer"):
+            talk()

@@ -12,6 +12,7 @@ from torch_ebip.kinematics import RobotArm
 from torch_ebip.losses import ForwardKinematicsLoss
 from torch_ebip.noise import AboveOne
 from torch_ebip.objective import ForecastObjective, Weights
+from torch_ebip.ranks import Ranks
 from torch_ebip.tuning import Tuner, TuningSettings
 from torch_ebip.tuning.partition import Partition
 
@@ -256,3 +257,37 @@ def test_bad_settings_are_named() -> None:
         Tuner(stranger, interactions(), primitive, objective, TARGETS, SUBSETS)
     with pytest.raises(ValueError, match="10 demonstrations, but the primitive has 24"):
         Tuner(ebip(primitive), interactions(10), primitive, objective, TARGETS, SUBSETS)
+
+
+def test_an_objective_needs_states_and_computes_only_what_counts() -> None:
+    primitive = small_primitive(torch.float64)
+    made = ebip(primitive, square_root=True)
+    y = interactions(dtype=torch.float64)[0][None, :20]
+    now = torch.tensor([[0.4]], dtype=torch.float64)
+    truth = torch.zeros(1, 1, 2, 2, dtype=torch.float64)
+    objective = ForecastObjective(primitive, TARGETS, weights=Weights(0.0, 0.0, 0.0, 2.0))
+    bare = made(y)
+    with pytest.raises(ValueError, match="kept no states"):
+        objective(made, bare, ~y.isnan(), truth, now, TARGETS)
+    with pytest.raises(ValueError, match="kept no states"):
+        objective.spread_and_error(made, bare, truth, TARGETS)
+    trace = made(y, keep=torch.tensor([[19]]))
+    terms = objective(made, trace, ~y.isnan(), truth, now, TARGETS)
+    assert list(terms) == ["innovation"]
+    expected = -2 * trace.log_likelihood.sum() / (~y.isnan()).sum()
+    torch.testing.assert_close(terms["innovation"], expected)
+
+
+def test_more_processes_than_interactions() -> None:
+    with pytest.raises(ValueError, match="9 processes, but only"):
+        filter_and_tuner(ranks=Ranks(0, 9))
+    _, tuner = filter_and_tuner(ranks=Ranks(0, 2))
+    with pytest.raises(ValueError, match="2 processes, but only 1 interactions"):
+        tuner.evaluate(torch.tensor([0]))
+
+
+def test_a_checkpoint_of_another_format(tmp_path: Path) -> None:
+    path = tmp_path / "c.pt"
+    torch.save({"format": 0, "configuration": {}, "content": {}}, path)
+    with pytest.raises(ValueError, match="checkpoint format 0, this version reads 1"):
+        load_checkpoint(path, {})

@@ -272,3 +272,33 @@ def test_restricting_is_exact() -> None:
     torch.testing.assert_close(a.projection[..., dofs], b.projection)
     torch.testing.assert_close(a.log_likelihood, b.log_likelihood)
     assert {id(p) for p in part.parameters()} <= {id(p) for p in whole.parameters()}
+
+
+def breaking() -> tuple[ExtendedFilter, GaussianState, torch.Tensor]:
+    """A filter, and a state whose covariance is none."""
+    made = bip(small_primitive(torch.float64))
+    mean, covariance = made.initial_state()
+    return made, GaussianState(mean, -1e6 * torch.eye(len(mean)).to(covariance)), torch.zeros(5, dtype=torch.float64)
+
+
+def test_a_covariance_that_cannot_be_factored_names_its_dofs() -> None:
+    made, state, y = breaking()
+    with pytest.raises(ValueError, match=r"cannot be factored.*\(hand.x.*\)"):
+        made.update(state, y)
+    made.dof_names = None
+    with pytest.raises(ValueError, match=r"first failing at DoF \[0"):
+        made.update(state, y)
+
+
+@pytest.mark.xfail(raises=IndexError, strict=True, reason="rows are counted twice where some DoFs are not measured")
+def test_a_covariance_that_cannot_be_factored_names_its_dofs_among_others() -> None:
+    made, state, y = breaking()
+    with pytest.raises(ValueError, match=r"cannot be factored.*\(gaze.yaw\)"):
+        made.update(state, y, torch.tensor([False, False, True, False, False]))
+
+
+def test_only_interactions_can_be_restricted() -> None:
+    made = bip(small_primitive())
+    made.dynamics = torch.nn.Identity()
+    with pytest.raises(TypeError, match="only filters of an interaction primitive"):
+        made.restrict(HUMAN)

@@ -196,3 +196,16 @@ def test_building_an_arm_is_quiet_and_importing_is_light() -> None:
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_a_loop_of_links_is_no_tree() -> None:
+    back = '<joint name="back" type="fixed"><parent link="tip"/><child link="base"/></joint></robot>'
+    with pytest.raises(ValueError, match="urdf: expected a tree of links, got a loop"):
+        RobotArm(TWO_LINKS.replace("</robot>", back), "tip")
+
+
+def test_a_tool_of_whole_numbers() -> None:
+    arm = RobotArm.ur5(torch.eye(4, dtype=torch.int64))
+    assert arm.tool.dtype == torch.get_default_dtype()
+    assert torch.equal(arm(torch.zeros(6)), RobotArm.ur5()(torch.zeros(6)))
+    assert "n_joints=6" in repr(arm)

@@ -421,3 +421,21 @@ def test_a_localised_filter_has_no_live_path() -> None:
     localised = filters()["localised"]
     assert isinstance(getattr(localised, "localisation", None), Localisation)
     assert not localised.has_live_path  # type: ignore[attr-defined]
+
+
+class Odd:
+    """Raises what it likes when it is asked for numbers."""
+
+    def __array__(self, *_: Any, **__: Any) -> np.ndarray:
+        raise KeyError("not numbers")
+
+
+def test_an_object_that_raises_is_malformed() -> None:
+    session = InteractionSession(filters()["ebip"], primitive())
+    session.push("hand", Odd(), 0.0)
+    assert session.report()["hand"].malformed == 1
+
+
+def test_a_filter_and_a_primitive_that_do_not_fit() -> None:
+    with pytest.raises(ValueError, match="the filter has 3 DoFs, the primitive's layout 5"):
+        InteractionSession(filters()["bip"].restrict(~primitive().layout.controlled), primitive())
