@@ -66,21 +66,28 @@ class FilterMethod:
         filter: that answers, as it is now.
         seed: of the draws; each interaction has its own.
         numbers: of the interactions that will be asked about, for their draws; default: 0, 1, ...
+        dtype: another one, for a study in which a percent does not matter.
     """
 
-    def __init__(self, filter: Filter, seed: int, numbers: Sequence[int] | None = None) -> None:
-        self.filter, self.seed, self.numbers = filter, seed, numbers
-        self._exact = copy.deepcopy(filter).double()
+    def __init__(
+        self,
+        filter: Filter,
+        seed: int,
+        numbers: Sequence[int] | None = None,
+        dtype: torch.dtype = torch.float64,
+    ) -> None:
+        self.filter, self.seed, self.numbers, self.dtype = filter, seed, numbers, dtype
+        self._filter = copy.deepcopy(filter).to(dtype)
 
     @torch.no_grad()
     def __call__(self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor) -> Answer:
         """See `Method`. DoFs that are neither shown nor asked for are left out of the filter."""
         used = observed.any(0).any(0) | dofs
-        part = self._exact.restrict(used)
+        part = self._filter.restrict(used)
         device = next(part.buffers()).device
         numbers = range(len(y)) if self.numbers is None else self.numbers
         draws = [seeded(self.seed, number) for number in numbers]
-        seen = (y[..., used].to(device, torch.float64), observed[..., used].to(device))
+        seen = (y[..., used].to(device, self.dtype), observed[..., used].to(device))
         trace = part(*seen, generator=draws, keep=keep.to(device), project=False)
         assert trace.kept is not None
         forecast = part.forecast(trace.kept, y.new_ones(1)).select(dofs[used].to(device)).at(0)
@@ -132,9 +139,18 @@ class NearestMethod:
         return Answer(Forecast(mean, torch.full_like(mean, torch.nan), y.new_ones(keep.shape)), at)
 
 
-def evaluate(task: Task, methods: Mapping[str, Method], tests: Demonstrations) -> Values:
-    """Values of every metric for every cell, method and test interaction."""
-    y, measured = tests.pad()
+def evaluate(
+    task: Task, methods: Mapping[str, Method], tests: Demonstrations, shown: Demonstrations | None = None
+) -> Values:
+    """Values of every metric for every cell, method and test interaction.
+
+    Args:
+        task: what is asked.
+        methods: that answer.
+        tests: what really happened.
+        shown: what methods get to see of it, sample by sample; default: all that was measured.
+    """
+    y, measured = (tests if shown is None else shown).pad()
     lengths = tests.lengths
     layout = tests.layout
     targets = layout.mask(task.targets)

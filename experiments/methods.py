@@ -27,7 +27,7 @@ from torch_ebip.checkpoint import load_checkpoint, save_checkpoint
 from torch_ebip.kinematics import RobotArm
 from torch_ebip.losses import ForwardKinematicsLoss
 from torch_ebip.monitor import Monitor
-from torch_ebip.noise import AboveOne
+from torch_ebip.noise import AboveOne, RobustWeights
 from torch_ebip.objective import ForecastObjective, Weights
 from torch_ebip.ranks import Ranks
 from torch_ebip.tuning import Tuner, TuningResult, TuningSettings
@@ -82,13 +82,16 @@ def scaled(primitive: InteractionPrimitive, factor: float, members: int | None =
     return ebip(primitive, members, residual_variance=factor * primitive.residual_variance)
 
 
-def tunable(primitive: InteractionPrimitive, start: Start, members: int | None = None) -> EnsembleFilter:
+def tunable(
+    primitive: InteractionPrimitive, start: Start, members: int | None = None, robust: RobustWeights | None = None
+) -> EnsembleFilter:
     """What is tuned: square-root eBIP whose R depends on phase, with inflation and evidence weights."""
     return ebip(
         primitive,
         members,
         residual_variance=start.factor * primitive.residual_variance,
         context=BSplineBasis(4),
+        robust=robust,
         inflation=AboveOne(primitive.weights.new_tensor(1.002)),
         square_root=True,
         weigh=True,
@@ -210,25 +213,62 @@ def _tuner(
     )
 
 
+def learn(
+    folder: Path,
+    problem: Problem,
+    settings: TuningSettings,
+    scan: int,
+    members: int,
+    progress: Callable[[int, float, float], None] | None,
+) -> None:
+    """Tune a filter of some members from the best start there is; what is finished is kept.
+
+    Args:
+        folder: gets the filter for `restore`, its report, checkpoints and TensorBoard's data.
+        problem: what is tuned for.
+        settings: with the same number of members.
+        scan: interactions that decide where tuning starts.
+        members: of the ensemble.
+        progress: called with step, loss and validation.
+    """
+    if (folder / "filter.pt").exists():
+        return
+
+    def build(primitive: InteractionPrimitive, factor: float) -> Filter:
+        return scaled(primitive, factor, members)
+
+    factor = best_factor(problem, build, settings, scan, FACTORS, folder / "scan_scaled.json")
+    start = best_start(problem, settings, scan, factor, folder / "scan_tunable.json", members)
+    tuned = tunable(problem.primitive, start, members)
+    with Monitor(folder / "tensorboard") as monitor:
+        result = tune(problem, tuned, settings, monitor, folder / "checkpoint.pt", progress)
+    report = {"start": start._asdict(), "factor_scaled": factor, "best_step": result.best_step}
+    write_json(folder / "report.json", {**report, "validation": result.validation})
+    keep(folder, start, tuned)
+
+
 def keep(folder: Path, start: Start, tuned: EnsembleFilter) -> None:
     """Leave a tuned filter in a folder, for `restore`."""
     parameters = {name: p.detach().cpu() for name, p in tuned.named_parameters()}
     save_checkpoint(folder / "filter.pt", {"start": start._asdict()}, {"parameters": parameters})
 
 
-def restore(folder: Path, primitive: InteractionPrimitive, members: int | None = None) -> EnsembleFilter:
+def restore(
+    folder: Path, primitive: InteractionPrimitive, members: int | None = None, robust: RobustWeights | None = None
+) -> EnsembleFilter:
     """The tuned filter that an experiment left in a run (or fold) folder.
 
     Args:
         folder: with ``report.json`` and ``filter.pt``.
         primitive: of the demonstrations that it was tuned on.
         members: size of its ensemble; default: all demonstrations.
+        robust: what surprising measurements count; default: as much as others, as while tuning.
 
     Raises:
         FileNotFoundError, ValueError: the files are not there, or not what a run writes.
     """
     start = Start(**json.loads((folder / "report.json").read_text())["start"])
     content = load_checkpoint(folder / "filter.pt", {"start": start._asdict()})
-    filter = tunable(primitive, start, members)
+    filter = tunable(primitive, start, members, robust)
     filter.load_state_dict(content["parameters"], strict=False)
     return filter

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from experiments import methods
 from experiments.data import load, thinning
-from experiments.methods import FACTORS, Problem, best_factor, best_start, keep, restore, scaled, tunable, tune
-from experiments.run_folder import write_json
+from experiments.methods import Problem, restore, scaled
 from torch_ebip import Filter, InteractionPrimitive, ebip, particle_filter, select_basis
-from torch_ebip.monitor import Monitor
 from torch_ebip.tuning import TuningSettings
 
 MEMBERS = 80
@@ -42,8 +41,6 @@ def learn(
         progress: called with step, loss and validation.
         scan: interactions that decide where tuning starts.
     """
-    if (folder / "filter.pt").exists():
-        return
     known, task = load(None, demonstrations, seed)
     primitive = know(demonstrations, seed)
     layout = known.layout
@@ -51,18 +48,7 @@ def learn(
     arm = task.arm[0], layout.mask([task.arm[1]])
     problem = Problem(known, primitive, layout.mask(task.targets), {"all": layout.mask(task.subsets["all"])}, arm)
     settings = TuningSettings(seed=seed, steps=steps, thinning=thinning(known), n_members=MEMBERS, horizons=HORIZONS)
-
-    def build(primitive: InteractionPrimitive, factor: float) -> Filter:
-        return scaled(primitive, factor, MEMBERS)
-
-    factor = best_factor(problem, build, settings, scan, FACTORS, folder / "scan_scaled.json")
-    start = best_start(problem, settings, scan, factor, folder / "scan_tunable.json", MEMBERS)
-    tuned = tunable(primitive, start, MEMBERS)
-    with Monitor(folder / "tensorboard") as monitor:
-        result = tune(problem, tuned, settings, monitor, folder / "checkpoint.pt", progress)
-    report = {"start": start._asdict(), "factor_scaled": factor, "best_step": result.best_step}
-    write_json(folder / "report.json", {**report, "validation": result.validation})
-    keep(folder, start, tuned)
+    methods.learn(folder, problem, settings, scan, MEMBERS, progress)
 
 
 def filters(folder: Path, primitive: InteractionPrimitive, factor: float) -> dict[str, Callable[[], Filter]]:

@@ -7,7 +7,7 @@ from torch_ebip.filters.evidence import Evidence, EvidenceWeighting
 from torch_ebip.filters.extended import ExtendedFilter, GaussianState, bip
 from torch_ebip.filters.forecast import Forecast
 from torch_ebip.filters.interaction import BasisProjection, ConstantVelocityPhase
-from torch_ebip.filters.live import LiveFilter
+from torch_ebip.filters.live import LiveFilter, LiveSnapshot
 from torch_ebip.filters.localisation import Localisation
 from torch_ebip.filters.members import EnsembleState
 from torch_ebip.filters.mixture import MixturePrior
@@ -28,6 +28,7 @@ __all__ = [
     "GaussianPrior",
     "GaussianState",
     "LiveFilter",
+    "LiveSnapshot",
     "Localisation",
     "MixturePrior",
     "MomentPrior",

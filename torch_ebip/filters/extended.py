@@ -117,7 +117,7 @@ class ExtendedFilter(Filter):
         try:
             factor = cholesky(S / (scale.unsqueeze(-1) * scale.unsqueeze(-2)), rows)
         except FactorisationError as error:
-            raise self._named(error, rows) from error
+            raise self._named(error, None) from error
         residual = values - predicted
         gain = torch.cholesky_solve(cross.transpose(-1, -2) / scale.unsqueeze(-1), factor) / scale.unsqueeze(-1)
         gain = gain.transpose(-1, -2)

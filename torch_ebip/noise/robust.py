@@ -61,10 +61,10 @@ class RobustWeights(nn.Module, ABC):
         """Weigh one sample.
 
         Args:
-            y: [..., D], finite; what was not measured may be anything finite.
-            mean: [..., D], of h(x).
+            y: [..., D], units of the DoFs, finite; what was not measured may be anything finite.
+            mean: [..., D], of h(x), in the same units.
             spread: [..., D], variance of h(x), squared units.
-            deviation: [D] or [..., D], standard deviations of the noise.
+            deviation: [D] or [..., D], standard deviations of the noise, in the same units.
             thinning: how many samples this one stands for; the noise is that of all of them together, each is
                 judged by its own.
         """
