@@ -10,8 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torch_ebip.folders import read_folder
 from torch_ebip.layout import Layout
-from torch_ebip.recordings import Array, Recordings, read_folder, read_npz, write_npz
+from torch_ebip.recordings import LIMIT, Array, Recordings, read_npz, write_npz
 
 
 class Demonstrations:
@@ -122,14 +123,17 @@ class Demonstrations:
         write_npz(path, Recordings(self.layout, arrays, self.rate, self.columns))
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Demonstrations:
-        """Read a ``.npz``; executes nothing of it. Errors: see `recordings.read_npz` and `Demonstrations`."""
-        return cls._from_recordings(path, read_npz(path))
+    def load(cls, path: str | os.PathLike[str], limit: int = LIMIT) -> Demonstrations:
+        """Read a ``.npz`` of at most so many bytes; executes nothing of it.
+
+        Errors: see `recordings.read_npz` and `Demonstrations`.
+        """
+        return cls._from_recordings(path, read_npz(path, limit))
 
     @classmethod
-    def load_folder(cls, path: str | os.PathLike[str]) -> Demonstrations:
-        """Read a folder of CSV files beside a ``layout.toml`` or ``layout.json``: see `recordings.read_folder`."""
-        return cls._from_recordings(path, read_folder(path))
+    def load_folder(cls, path: str | os.PathLike[str], limit: int = LIMIT) -> Demonstrations:
+        """Read a folder of CSV files beside a ``layout.toml`` or ``layout.json``: see `folders.read_folder`."""
+        return cls._from_recordings(path, read_folder(path, limit))
 
     @classmethod
     def _from_recordings(cls, path: str | os.PathLike[str], recordings: Recordings) -> Demonstrations:

@@ -1,13 +1,63 @@
-"""Writing files so that a reader never sees half of one."""
+"""Files: opened only if they are what they should be, written so that a reader never sees half of one."""
 
 from __future__ import annotations
 
 import os
+import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
+
+
+def open_file(path: str | os.PathLike[str], limit: int) -> IO[bytes]:
+    """Open a regular file, or a link to one, for reading bytes. Never waits, as opening a FIFO otherwise does.
+
+    Args:
+        path: of the file.
+        limit: bytes; a larger file is refused.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: a folder, FIFO or device, a loop of links, a file that may not be read or is too large.
+    """
+    try:
+        # The flags do not exist on every system; a file that is only a file does not need them.
+        flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0) | getattr(os, "O_BINARY", 0)
+        handle = os.open(path, flags)
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+        raise ValueError(f"{path}: cannot be opened: {error}") from error
+    try:
+        status = os.fstat(handle)
+        if not stat.S_ISREG(status.st_mode):
+            raise ValueError(f"{path}: expected a regular file, got a folder, a device or a pipe")
+        if status.st_size > limit:
+            raise ValueError(f"{path}: {status.st_size} bytes, expected at most {limit}")
+        return os.fdopen(handle, "rb")
+    except BaseException:
+        os.close(handle)
+        raise
+
+
+def read_text(path: str | os.PathLike[str], limit: int) -> str:
+    """The text of a UTF-8 file of at most so many bytes.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: see `open_file`; or it is not UTF-8.
+    """
+    with open_file(path, limit) as file:
+        try:
+            # Once more than the limit: files of /proc say that they are empty.
+            content = file.read(limit + 1)
+            if len(content) > limit:
+                raise ValueError(f"more than {limit} bytes")
+            return content.decode("utf-8")
+        except (OSError, ValueError) as error:
+            raise ValueError(f"{path}: not readable as text in UTF-8: {error}") from error
 
 
 @contextmanager

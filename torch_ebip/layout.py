@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -76,7 +77,7 @@ class Layout:
     @property
     def n_dofs(self) -> int:
         """D, the number of columns."""
-        return len(self.dofs)
+        return sum(len(modality.dofs) for modality in self.modalities)
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -131,6 +132,6 @@ class Layout:
 
 
 def _reject_repeats(what: str, names: Sequence[str]) -> None:
-    repeated = sorted({name for name in names if names.count(name) > 1})
+    repeated = sorted(name for name, count in Counter(names).items() if count > 1)
     if repeated:
         raise ValueError(f"{what} named more than once: {', '.join(repeated)}")
