@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import os
-import pickle
-from collections.abc import Mapping
+import zipfile
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import torch
 
+from torch_ebip.archives import open_archive
 from torch_ebip.files import atomic_write
 
 FORMAT = 1
+LIMIT = 1 << 32
+"""Bytes that a checkpoint may have, unless a caller says something else."""
+_PLAIN = (bool, int, float, str, type(None))
 
 
 def save_checkpoint(
@@ -28,44 +32,68 @@ def save_checkpoint(
         torch.save({"format": FORMAT, "configuration": dict(configuration), "content": dict(content)}, file)
 
 
-def load_checkpoint(path: str | os.PathLike[str], configuration: Mapping[str, Any]) -> dict[str, Any]:
+def load_checkpoint(
+    path: str | os.PathLike[str], configuration: Mapping[str, Any], limit: int = LIMIT
+) -> dict[str, Any]:
     """Read the content of a checkpoint; executes nothing of it.
 
     Args:
         path: of the file.
-        configuration: of this run; what the checkpoint was written with must be equal to it.
+        configuration: that it must have been written with.
+        limit: bytes; more is refused before it is read.
 
     Raises:
         FileNotFoundError: there is none.
-        ValueError: the file is cut off or not a checkpoint, or it was written with another configuration;
-            names what differs.
+        ValueError: the file is cut off, damaged, too large or not a checkpoint, or it was written with another
+            configuration; names what differs.
     """
     try:
-        stored = torch.load(path, map_location="cpu", weights_only=True)
-        version, theirs, content = stored["format"], dict(stored["configuration"]), dict(stored["content"])
+        with open_archive(path, limit, (zipfile.ZIP_STORED,)) as (file, archive):
+            # Torch compares no sums: a flipped bit would be a weight.
+            damaged = archive.testzip()
+            if damaged is not None:
+                raise ValueError(f"{damaged!r} in it is not what was written")
+            file.seek(0)
+            stored = torch.load(file, map_location="cpu", weights_only=True)
+        version, theirs, content = stored["format"], stored["configuration"], stored["content"]
+        if not isinstance(theirs, dict) or not isinstance(content, dict):
+            raise ValueError("no configuration or content in it")
+        if not all(isinstance(name, str) for name in theirs):
+            raise ValueError("settings without names")
     except FileNotFoundError:
         raise
-    except (
-        pickle.UnpicklingError,
-        RuntimeError,
-        EOFError,
-        KeyError,
-        IndexError,
-        TypeError,
-        ValueError,
-        OSError,
-    ) as error:
+    except Exception as error:  # damaged bytes raise nearly anything, a lack of memory included
         raise ValueError(
-            f"{path}: not a readable checkpoint (cut off, damaged or of another kind): {error}"
+            f"{path}: not a readable checkpoint (cut off, damaged or of another kind): {str(error)[:500]}"
         ) from error
-    if version != FORMAT:
-        raise ValueError(f"{path}: checkpoint format {version}, this version reads {FORMAT}")
-    ours = dict(configuration)
-    differing = [
-        f"{name}: {theirs.get(name)!r} there, {ours.get(name)!r} here"
-        for name in sorted({*theirs, *ours})
-        if theirs.get(name) != ours.get(name)
-    ]
+    if type(version) is not int or version != FORMAT:
+        raise ValueError(f"{path}: checkpoint format {_brief(version)}, this version reads {FORMAT}")
+    differing = list(_differences(theirs, configuration))
     if differing:
         raise ValueError(f"{path}: checkpoint of another configuration: {'; '.join(differing)}")
-    return content
+    return dict(content)
+
+
+def _differences(theirs: Mapping[Any, Any], ours: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """What differs, by name. Goes as deep as ours: theirs may be made to be endless."""
+    for name in sorted({*theirs, *ours}, key=str):
+        there, here = theirs.get(name), ours.get(name)
+        if isinstance(there, dict) and isinstance(here, Mapping):
+            yield from _differences(there, here, f"{prefix}{name}.")
+        elif not _same(there, here):
+            yield f"{prefix}{name}: {_brief(there)} there, {_brief(here)} here"
+
+
+def _same(there: Any, here: Any) -> bool:
+    if isinstance(here, list | tuple):
+        return isinstance(there, list | tuple) and len(there) == len(here) and all(map(_same, there, here))
+    return isinstance(there, _PLAIN) and isinstance(here, _PLAIN) and there == here
+
+
+def _brief(value: Any) -> str:
+    """Numbers, strings and short lists of them; of anything else, which may be of any size, the type."""
+    if isinstance(value, list | tuple) and len(value) <= 20 and all(isinstance(item, _PLAIN) for item in value):
+        return f"[{', '.join(_brief(item) for item in value)}]"
+    if isinstance(value, int) and abs(value) > 1 << 64:
+        return "a huge number"
+    return repr(value)[:80] if isinstance(value, _PLAIN) else f"a {type(value).__name__}"

@@ -287,9 +287,12 @@ class Tuner:
     def _resume(self, optimizer: torch.optim.Optimizer) -> tuple[int, dict[str, Tensor], dict[int, float]]:
         assert self.checkpoint is not None
         content = load_checkpoint(self.checkpoint, self._configuration())
-        self._restore(content["parameters"])
-        optimizer.load_state_dict(content["optimizer"])
-        return content["step"], content["best"], content["validation"]
+        try:
+            self._restore(content["parameters"])
+            optimizer.load_state_dict(content["optimizer"])
+            return content["step"], content["best"], content["validation"]
+        except (AttributeError, IndexError, KeyError, RuntimeError, TypeError) as error:
+            raise ValueError(f"{self.checkpoint}: not the state of this tuning: {error}") from error
 
 
 def _fingerprint(module: nn.Module) -> dict[str, str]:
