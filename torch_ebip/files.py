@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import IO
 
 
-def open_file(path: str | os.PathLike[str], limit: int) -> IO[bytes]:
+def open_file(path: str | os.PathLike[str], limit: int | None) -> IO[bytes]:
     """Open a regular file, or a link to one, for reading bytes. Never waits, as opening a FIFO otherwise does.
 
     Args:
         path: of the file.
-        limit: bytes; a larger file is refused.
+        limit: bytes; a larger file is refused; None for what is read piece by piece.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -34,7 +34,7 @@ def open_file(path: str | os.PathLike[str], limit: int) -> IO[bytes]:
         status = os.fstat(handle)
         if not stat.S_ISREG(status.st_mode):
             raise ValueError(f"{path}: expected a regular file, got a folder, a device or a pipe")
-        if status.st_size > limit:
+        if limit is not None and status.st_size > limit:
             raise ValueError(f"{path}: {status.st_size} bytes, expected at most {limit}")
         return os.fdopen(handle, "rb")
     except BaseException:

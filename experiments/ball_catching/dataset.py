@@ -133,6 +133,6 @@ def _digest() -> str:
     digest = hashlib.sha256()
     for name in names:
         digest.update((here / f"{name}.py").read_bytes())
-    for name in ("arm.py", "ur5.urdf"):
+    for name in ("arm.py", "urdf.py", "ur5.urdf"):
         digest.update(resources.files("torch_ebip.kinematics").joinpath(name).read_bytes())
     return digest.hexdigest()[:12]

@@ -3,7 +3,8 @@
 The kinematic chain itself is pytorch-kinematics' (https://github.com/UM-ARM-Lab/pytorch_kinematics), with
 three things put right around it:
 
-- its URDF reader rounds every origin to float32, here the tree is assembled in float64 from the parsed text;
+- its URDF reader rounds every origin to float32, takes a joint without an axis to turn about z instead of x, and
+  expects well-meant files: here the tree is assembled in float64 from what `urdf.py` reads;
 - its chains are plain objects, so `arm.double()` or `arm.to("cuda")` would leave them behind: here one chain
   a dtype and device is cast from the float64 original when it is first needed, so that casting there and
   back loses nothing;
@@ -17,11 +18,12 @@ import copy
 import math
 from importlib import resources
 from os import PathLike
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+
+from torch_ebip.kinematics.urdf import Vector, chain_of_joints, read_urdf
 
 
 class RobotArm(nn.Module):
@@ -32,6 +34,9 @@ class RobotArm(nn.Module):
         end_link: link whose frame carries the tool.
         tool: homogeneous transform from `end_link` to the tool, shape [4, 4], metres; identity if left out.
 
+    Raises:
+        ValueError: a URDF that cannot be read or gives no pose, no such link, or no such transform.
+
     `joint_names` is a tuple in the order of the joint vector.
     """
 
@@ -39,7 +44,7 @@ class RobotArm(nn.Module):
 
     def __init__(self, urdf: str | PathLike[str], end_link: str, tool: Tensor | None = None) -> None:
         super().__init__()
-        self._master = _build_chain(_read(urdf), end_link)
+        self._master = _build_chain(read_urdf(urdf), end_link)
         self._chains: dict[tuple[torch.dtype, torch.device], Any] = {}
         self.joint_names: tuple[str, ...] = tuple(self._master.get_joint_parameter_names())
         self.register_buffer("tool", _checked_tool(tool))
@@ -119,70 +124,29 @@ def _checked_tool(tool: Tensor | None) -> Tensor:
     return tool.detach().clone()
 
 
-def _read(urdf: str | PathLike[str]) -> str:
-    """The text of a URDF given as such or by its path."""
-    if isinstance(urdf, str) and urdf.lstrip().startswith("<"):
-        return urdf
-    try:
-        return Path(urdf).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(
-            f"urdf: expected the path of a readable URDF file or its XML text, got {str(urdf)[:80]!r} ({error})"
-        ) from error
-
-
 def _build_chain(text: str, end_link: str) -> Any:
     """pytorch-kinematics' `SerialChain` in float64 from the root link to `end_link`."""
-    # Imported here: it pulls in matplotlib and a URDF parser, which nobody without an arm should wait for.
+    # Imported here: it pulls in matplotlib, which nobody without an arm should wait for.
     from pytorch_kinematics import Transform3d
     from pytorch_kinematics.chain import Chain, SerialChain
     from pytorch_kinematics.frame import Frame, Joint, Link
-    from pytorch_kinematics.urdf import JOINT_TYPE_MAP
-    from pytorch_kinematics.urdf_parser_py.urdf import URDF
 
-    try:
-        # Bytes: lxml, below that parser, refuses an encoding declaration in a str.
-        robot = URDF.from_xml_string(text.encode("utf-8"))
-    except Exception as error:  # the parser raises a different class for every kind of fault
-        raise ValueError(
-            f"urdf: expected a URDF <robot>, got text that does not parse ({type(error).__name__}: {error})"
-        ) from error
-    names = [link.name for link in robot.links]
-    if end_link not in names:
-        raise ValueError(f"end_link: expected one of the URDF's links ({', '.join(names)}), got {end_link!r}")
-
-    # From the end link up to the root: only these joints matter, whatever else hangs on the robot.
-    above = {joint.child: joint for joint in robot.joints}
-    path: list[Any] = []
-    link = end_link
-    while link in above:
-        path.append(above[link])
-        link = above[link].parent
-        if len(path) > len(robot.joints):
-            raise ValueError(f"urdf: expected a tree of links, got a loop through {link!r}")
-    unsupported = [joint.name for joint in path if joint.type not in JOINT_TYPE_MAP]
-    if unsupported:
-        raise ValueError(
-            f"urdf: expected joints of type {', '.join(JOINT_TYPE_MAP)} on the way to {end_link!r}, "
-            f"got others: {', '.join(unsupported)}"
-        )
-
+    link, joints = chain_of_joints(text, end_link)
     root = Frame(link, Link(link), Joint(dtype=torch.float64))
     tip = root
-    for joint in reversed(path):
-        limit = joint.limit
-        bounded = limit is not None and joint.type != "continuous"
+    for joint in joints:
         frame = Frame(
             joint.child,
             Link(joint.child),
             Joint(
                 joint.name,
-                offset=Transform3d(matrix=_origin(joint.origin), dtype=torch.float64),
-                joint_type=JOINT_TYPE_MAP[joint.type],
-                axis=joint.axis,
+                offset=Transform3d(matrix=_origin(joint.xyz, joint.rpy), dtype=torch.float64),
+                joint_type=joint.kind,
+                # The axis of a fixed joint may be anything, and is divided by its length.
+                axis=None if joint.kind == "fixed" else joint.axis,
                 dtype=torch.float64,
-                limits=(limit.lower, limit.upper) if bounded else None,
-                velocity_limits=None if limit is None else (-limit.velocity, limit.velocity),
+                limits=joint.limits,
+                velocity_limits=None if joint.speed is None else (-joint.speed, joint.speed),
             ),
         )
         tip.add_child(frame)
@@ -190,22 +154,18 @@ def _build_chain(text: str, end_link: str) -> Any:
     return SerialChain(Chain(root, dtype=torch.float64), end_link, dtype=torch.float64)
 
 
-def _origin(origin: Any) -> Tensor:
+def _origin(xyz: Vector, rpy: Vector) -> Tensor:
     """A URDF <origin xyz rpy> as a homogeneous transform [4, 4]; R = Rz(yaw) Ry(pitch) Rx(roll)."""
-    transform = torch.eye(4, dtype=torch.float64)
-    if origin is None:
-        return transform
-    roll, pitch, yaw = origin.rpy if origin.rpy is not None else (0.0, 0.0, 0.0)
+    roll, pitch, yaw = rpy
     cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
     cy, sy = math.cos(yaw), math.sin(yaw)
-    transform[:3, :3] = torch.tensor(
+    x, y, z = xyz
+    return torch.tensor(
         [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr, x],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr, y],
+            [-sp, cp * sr, cp * cr, z],
+            [0, 0, 0, 1],
         ],
         dtype=torch.float64,
     )
-    if origin.xyz is not None:
-        transform[:3, 3] = torch.tensor(origin.xyz, dtype=torch.float64)
-    return transform
