@@ -6,12 +6,15 @@ The first line says which session it was; then ``["push", sensor, time, values]`
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
+
+from torch_ebip.files import open_file
 
 FORMAT = 1
 KIND = "torch_ebip session"
@@ -67,8 +70,8 @@ def read_log(path: str | os.PathLike[str]) -> tuple[dict[str, Any], Iterator[lis
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is no recording of a session, or of another format. Entries raise it at a line that is
-            damaged; a last line that is cut off, as a crash leaves it, is left out with a warning.
+        ValueError: it cannot be read, is no recording of a session, or of another format. Entries raise it at a
+            line that is damaged; a last line that is cut off, as a crash leaves it, is left out with a warning.
     """
     lines = _lines(Path(path))
     first = next(lines, None)
@@ -91,7 +94,7 @@ def _entries(path: Path, lines: Iterator[tuple[int, Any]]) -> Iterator[list[Any]
 
 
 def _lines(path: Path) -> Iterator[tuple[int, Any]]:
-    with path.open(encoding="utf-8", errors="replace") as file:
+    with io.TextIOWrapper(open_file(path, None), encoding="utf-8", errors="replace") as file:
         number = 0
         while line := file.readline(LONGEST_LINE):
             number += 1

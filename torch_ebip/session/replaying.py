@@ -15,6 +15,11 @@ from torch_ebip.session.log import read_log
 from torch_ebip.session.session import InteractionSession, SessionForecast, fingerprint
 from torch_ebip.session.settings import SessionSettings
 
+MOST_TICKS = 2000
+"""Of a window: the session keeps a state of the filter for each."""
+MOST_HORIZONS = 10_000
+"""Of one forecast."""
+
 
 class Replay(NamedTuple):
     """A session as it was at the end of its recording.
@@ -56,8 +61,10 @@ def replay(path: str | os.PathLike[str], filter: Filter, primitive: InteractionP
         if set(header["settings"]) != known:
             raise ValueError(f"expected {', '.join(sorted(known))}, got {str(header['settings'])[:200]}")
         settings = SessionSettings(**header["settings"])
+        if max(settings.window, settings.longest_gap / 50) > MOST_TICKS * filter.dt:
+            raise ValueError(f"a window of more than {MOST_TICKS} ticks, or a gap of more than 50 times as many")
         session = InteractionSession(filter, primitive, header["sensors"], settings)
-    except (KeyError, TypeError, ValueError, OverflowError, RuntimeError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, RuntimeError, MemoryError) as error:
         raise ValueError(f"{path}: the settings of the session are damaged: {error}") from error
     forecasts, recorded = [], []
     for entry in entries:
@@ -67,8 +74,10 @@ def replay(path: str | os.PathLike[str], filter: Filter, primitive: InteractionP
             elif entry[0] == "advance":
                 session.advance(entry[1])
             else:
+                if isinstance(entry[2], list) and len(entry[2]) > MOST_HORIZONS:
+                    raise ValueError(f"more than {MOST_HORIZONS} horizons")
                 forecasts.append(session.forecast(entry[2], entry[1]))
                 recorded.append(torch.tensor(entry[3], dtype=next(filter.parameters()).dtype))
-        except (TypeError, ValueError, OverflowError, RuntimeError) as error:
+        except (TypeError, ValueError, OverflowError, RuntimeError, MemoryError) as error:
             raise ValueError(f"{path}: damaged: {str(entry)[:80]}: {error}") from error
     return Replay(session, forecasts, recorded)
