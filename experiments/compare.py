@@ -11,7 +11,6 @@ are what one would try without a filter. Without --data the recordings are the s
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -25,7 +24,7 @@ from experiments.figures import results_figure
 from experiments.folds import LOST, mean_of_cells, read_values, run_folds, share_cores, split, write_values
 from experiments.paper_table import paper_rows
 from experiments.results import Values, markdown, print_tables, summarise
-from experiments.run_folder import RunFolder, write_json
+from experiments.run_folder import RunFolder, read_json, write_json
 from torch_ebip.files import atomic_write
 from torch_ebip.ranks import RankLostError, Ranks
 from torch_ebip.tuning import TuningSettings
@@ -141,7 +140,7 @@ def main(arguments: list[str] | None = None) -> None:
         return
     seconds: dict[str, float] = {}
     for path in sorted(run.path.glob("fold-*/*-seconds.json")):
-        spent = sum(json.loads(path.read_text()).values())
+        spent = sum(read_json(path).values())
         name = path.name.removesuffix("-seconds.json")
         seconds[name] = round(seconds.get(name, 0.0) + spent, 1)
     results = {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +14,7 @@ import torch
 from tqdm import tqdm
 
 from experiments.results import Cell, Values
-from experiments.run_folder import write_json
+from experiments.run_folder import read_json, write_json
 from torch_ebip.ranks import Ranks
 
 Job = TypeVar("Job")
@@ -120,9 +119,20 @@ def write_values(path: Path, values: Values) -> None:
 
 
 def read_values(path: Path) -> Values:
-    """What `write_values` wrote."""
+    """What `write_values` wrote.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is damaged, or something else.
+    """
+    content = read_json(path)
     values: Values = {}
-    for entry in json.loads(path.read_text()):
-        arrays = {name: np.array(v, dtype=np.float64) for name, v in entry.pop("values").items()}
-        values[Cell(**entry)] = arrays
+    try:
+        for entry in content:
+            arrays = {name: np.array(v, dtype=np.float64) for name, v in entry.pop("values").items()}
+            if len({array.shape for array in arrays.values()}) != 1 or any(a.ndim != 1 for a in arrays.values()):
+                raise ValueError("expected as many numbers for every method")
+            values[Cell(**entry)] = arrays
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{path}: not the values of a fold: {error}") from error
     return values

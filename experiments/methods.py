@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
@@ -12,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from experiments.run_folder import write_json
+from experiments.run_folder import read_json, write_json
 from torch_ebip import (
     BSplineBasis,
     Demonstrations,
@@ -130,8 +129,12 @@ def best_factor(
         record: file of the losses, written when all are known; if it exists, its best factor is returned.
     """
     if record.exists():
-        stored = {float(factor): loss for factor, loss in json.loads(record.read_text()).items()}
-        return min(stored, key=lambda factor: stored[factor])
+        content = read_json(record)
+        try:
+            stored = {float(factor): loss for factor, loss in content.items()}
+            return min(stored, key=lambda factor: stored[factor])
+        except (AttributeError, TypeError, ValueError) as error:
+            raise ValueError(f"{record}: expected a loss for every factor: {error}") from error
     losses: dict[float, float] = {}
     order = torch.randperm(len(problem.primitive), generator=torch.Generator().manual_seed(settings.seed + 1))
 
@@ -173,9 +176,12 @@ def best_start(
         if problem.ranks.first:
             write_json(record, losses)
     else:
-        losses = json.loads(record.read_text())
-    best = min(losses, key=lambda entry: entry["loss"])
-    return Start(best["factor"], best["sharpness"])
+        losses = read_json(record)
+    try:
+        best = min(losses, key=lambda entry: entry["loss"])
+        return Start(best["factor"], best["sharpness"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{record}: expected a list of starts with their losses: {error}") from error
 
 
 def tune(
@@ -267,8 +273,21 @@ def restore(
     Raises:
         FileNotFoundError, ValueError: the files are not there, or not what a run writes.
     """
-    start = Start(**json.loads((folder / "report.json").read_text())["start"])
-    content = load_checkpoint(folder / "filter.pt", {"start": start._asdict()})
-    filter = tunable(primitive, start, members, robust)
-    filter.load_state_dict(content["parameters"], strict=False)
+    report = read_json(folder / "report.json")
+    try:
+        start = Start(**{name: float(value) for name, value in report["start"].items()})
+        filter = tunable(primitive, start, members, robust)
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{folder / 'report.json'}: says of no filter where it started: {error}") from error
+    parameters = load_checkpoint(folder / "filter.pt", {"start": start._asdict()}).get("parameters")
+    try:
+        names = {name for name, _ in filter.named_parameters() if not name.startswith("noise.robust.")}
+        missing = names ^ set(parameters)
+        if missing:
+            raise ValueError(f"other parameters: {', '.join(sorted(map(str, missing)))[:200]}")
+        if not all(bool(parameter.isfinite().all()) for parameter in parameters.values()):
+            raise ValueError("parameters that are not finite")
+        filter.load_state_dict(parameters, strict=False)  # buffers are the primitive's
+    except (AttributeError, TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{folder / 'filter.pt'}: not the filter of this run: {error}") from error
     return filter

@@ -13,7 +13,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from torch_ebip.files import atomic_write
+from torch_ebip.files import atomic_write, read_text
+
+LARGEST_JSON = 1 << 28
+"""Bytes."""
 
 
 class RunFolder:
@@ -54,7 +57,7 @@ class RunFolder:
     def _stored(self, config: Path, experiment: str) -> dict[str, Any]:
         """The settings of the run that the folder holds; SystemExit if it holds none of this experiment."""
         try:
-            content = json.loads(config.read_text())
+            content = read_json(config)
             found, settings = content["experiment"], dict(content["settings"])
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise SystemExit(f"{self.path} holds files but no run; choose another --out") from error
@@ -78,6 +81,20 @@ class RunFolder:
     def results(self) -> Path:
         """``results.json``, there once the run is finished."""
         return self.path / "results.json"
+
+
+def read_json(path: Path) -> Any:
+    """What `write_json` wrote.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no JSON, or cannot be read.
+    """
+    text = read_text(path, LARGEST_JSON)
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: not what a run writes, or damaged: {error}") from error
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -11,7 +11,6 @@ folds if there are several; the result is the same.
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -36,7 +35,7 @@ from experiments.folds import (
 )
 from experiments.methods import FACTORS, Problem, best_factor, best_start, keep, scaled, tunable, tune
 from experiments.results import Values, print_tables, summarise
-from experiments.run_folder import RunFolder, write_json
+from experiments.run_folder import RunFolder, read_json, write_json
 from torch_ebip import InteractionPrimitive, select_basis
 from torch_ebip.basis import rank_candidates, selection_table
 from torch_ebip.monitor import Monitor
@@ -201,7 +200,7 @@ def main(arguments: list[str] | None = None) -> None:
             "folds": options.folds,
         },
         **summarise(values, "ebip_tuned"),
-        "reports": [json.loads((Path(job.folder) / "report.json").read_text()) for job in jobs],
+        "reports": [read_json(Path(job.folder) / "report.json") for job in jobs],
         "seconds": round(time.monotonic() - began, 1),
     }
     panels: list[tuple[str, str | None]] = [(metric, m) for m in task.targets for metric in ("mse", "mae")]

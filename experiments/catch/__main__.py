@@ -9,7 +9,6 @@ demonstration, `reactive` sees the ball only, but knows its physics and the arm'
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
 import time
@@ -23,7 +22,7 @@ from experiments.catch.jobs import METHODS, Plan, as_settings, run_all
 from experiments.catch.learning import learn
 from experiments.catch.table import markdown, print_table, summarise
 from experiments.catch.throws import LATENCY
-from experiments.run_folder import RunFolder, write_json
+from experiments.run_folder import RunFolder, read_json, write_json
 from torch_ebip.files import atomic_write
 
 GROUPS = {"imu": ("imu_acceleration", "imu_gyro"), "shoes": ("shoe_left", "shoe_right")}
@@ -114,7 +113,7 @@ def _lead(text: str) -> float | None:
 def _take(source: Path, plan: Plan) -> dict[str, bytes]:
     """The files of another run's tuned filter, which must have been tuned on the same demonstrations."""
     try:
-        theirs = json.loads((source / "config.json").read_text())["settings"]
+        theirs = read_json(source / "config.json")["settings"]
         content = {name: (source / name).read_bytes() for name in ("filter.pt", "report.json")}
         there = theirs["demonstrations"], theirs["seed"]
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -26,7 +25,7 @@ from experiments.catch.controllers import (
 from experiments.catch.learning import filters, know
 from experiments.catch.throws import CONDITIONS, Toss, draw
 from experiments.catch.trial import Drop, Outcome, run
-from experiments.run_folder import write_json
+from experiments.run_folder import read_json, write_json
 from torch_ebip import Filter, InteractionPrimitive
 
 METHODS = ("ebip_tuned", "ebip_tuned_all", "ebip_scaled", "ebip", "particle_filter", "mean", "reactive")
@@ -99,7 +98,7 @@ class Bench:
             return ReactiveController(self.reach, self.liked, self.plan.limits)
         if method not in self._filters:
             folder = Path(self.plan.folder)
-            factor = json.loads((folder / "report.json").read_text())["factor_scaled"]
+            factor = read_json(folder / "report.json")["factor_scaled"]
             self._filters[method] = filters(folder, self.primitive, factor)[method]()
         seed = 1000 * self.plan.seed + toss.number
         return SessionController(self._filters[method], self.primitive, seed, self.plan.lead)
@@ -118,7 +117,7 @@ def bench(plan: Plan) -> Bench:
 def run_portion(portion: Portion) -> list[dict[str, Any]]:
     """Outcomes of a portion, computed or read from its file."""
     if portion.file.exists():
-        content: list[dict[str, Any]] = json.loads(portion.file.read_text())
+        content: list[dict[str, Any]] = read_json(portion.file)
         return content
     torch.set_num_threads(1)
     mine = bench(portion.plan)
