@@ -62,7 +62,7 @@ def _check_ends(path: str | os.PathLike[str], file: IO[bytes]) -> None:
 
     `zipfile` reads the directory at once, whatever its size.
     """
-    size = os.fstat(file.fileno()).st_size
+    size = file.seek(0, os.SEEK_END)
     file.seek(max(0, size - 98))
     tail = file.read(98)
     file.seek(0)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import pickletools
+import re
 import zipfile
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -15,6 +17,9 @@ from torch_ebip.files import atomic_write
 FORMAT = 1
 LIMIT = 1 << 32
 """Bytes that a checkpoint may have, unless a caller says something else."""
+CODE_LIMIT = 1 << 22
+"""Bytes of a checkpoint beside its tensors."""
+_MADE = re.compile(r"collections OrderedDict|torch (Size|\w+Storage)|torch\._utils _rebuild_(tensor_v2|parameter)")
 _PLAIN = (bool, int, float, str, type(None))
 
 
@@ -49,6 +54,7 @@ def load_checkpoint(
     """
     try:
         with open_archive(path, limit, (zipfile.ZIP_STORED,)) as (file, archive):
+            _check_code(archive)
             # Torch compares no sums: a flipped bit would be a weight.
             damaged = archive.testzip()
             if damaged is not None:
@@ -63,8 +69,10 @@ def load_checkpoint(
     except FileNotFoundError:
         raise
     except Exception as error:  # damaged bytes raise nearly anything, a lack of memory included
+        # Without torch's advice to load it unsafely.
+        reason = str(error).rpartition("WeightsUnpickler error:")[2].strip()[:300]
         raise ValueError(
-            f"{path}: not a readable checkpoint (cut off, damaged or of another kind): {str(error)[:500]}"
+            f"{path}: not a readable checkpoint (cut off, damaged or of another kind): {reason}"
         ) from error
     if type(version) is not int or version != FORMAT:
         raise ValueError(f"{path}: checkpoint format {_brief(version)}, this version reads {FORMAT}")
@@ -72,6 +80,17 @@ def load_checkpoint(
     if differing:
         raise ValueError(f"{path}: checkpoint of another configuration: {'; '.join(differing)}")
     return dict(content)
+
+
+def _check_code(archive: zipfile.ZipFile) -> None:
+    """Nothing but tensors, numbers, strings and containers: torch also makes bytes of any length, as a file asks."""
+    for member in archive.infolist():
+        if member.filename.endswith("/data.pkl"):
+            if member.file_size > CODE_LIMIT:
+                raise ValueError(f"{member.file_size} bytes beside the tensors, expected at most {CODE_LIMIT}")
+            for opcode, argument, _ in pickletools.genops(archive.read(member)):
+                if opcode.name == "GLOBAL" and not _MADE.fullmatch(str(argument)):
+                    raise ValueError(f"{str(argument)[:80]!r} in it is none of tensors, numbers, strings, containers")
 
 
 def _differences(theirs: Mapping[Any, Any], ours: Mapping[str, Any], prefix: str = "") -> Iterator[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import stat
 import tempfile
@@ -25,21 +26,21 @@ def open_file(path: str | os.PathLike[str], limit: int | None) -> IO[bytes]:
     try:
         # The flags do not exist on every system; a file that is only a file does not need them.
         flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0) | getattr(os, "O_BINARY", 0)
-        handle = os.open(path, flags)
+        file = io.BufferedReader(io.FileIO(path, opener=lambda path, _: os.open(path, flags)))  # refuses folders
     except FileNotFoundError:
         raise
     except (OSError, ValueError) as error:  # ValueError: a NUL in the path
         raise ValueError(f"{path}: cannot be opened: {error}") from error
-    try:
-        status = os.fstat(handle)
-        if not stat.S_ISREG(status.st_mode):
-            raise ValueError(f"{path}: expected a regular file, got a folder, a device or a pipe")
-        if limit is not None and status.st_size > limit:
-            raise ValueError(f"{path}: {status.st_size} bytes, expected at most {limit}")
-        return os.fdopen(handle, "rb")
-    except BaseException:
-        os.close(handle)
-        raise
+    status = os.fstat(file.fileno())
+    if stat.S_ISREG(status.st_mode) and 0 < status.st_size <= (status.st_size if limit is None else limit):
+        return file
+    file.close()
+    if not stat.S_ISREG(status.st_mode):
+        raise ValueError(f"{path}: expected a regular file, got a device or a pipe")
+    if status.st_size > 0:
+        raise ValueError(f"{path}: {status.st_size} bytes, expected at most {limit}")
+    # Files of /proc say that they are empty and are not, or are waited for: they are taken at their word.
+    return io.BytesIO()
 
 
 def read_text(path: str | os.PathLike[str], limit: int) -> str:
@@ -51,11 +52,7 @@ def read_text(path: str | os.PathLike[str], limit: int) -> str:
     """
     with open_file(path, limit) as file:
         try:
-            # Once more than the limit: files of /proc say that they are empty.
-            content = file.read(limit + 1)
-            if len(content) > limit:
-                raise ValueError(f"more than {limit} bytes")
-            return content.decode("utf-8")
+            return file.read(limit).decode("utf-8")
         except (OSError, ValueError) as error:
             raise ValueError(f"{path}: not readable as text in UTF-8: {error}") from error
 

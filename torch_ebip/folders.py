@@ -58,7 +58,8 @@ def read_folder(path: str | os.PathLike[str], limit: int = LIMIT) -> Recordings:
     trajectories = []
     for file in files:
         with open_file(file, limit) as stream:
-            limit -= os.fstat(stream.fileno()).st_size
+            limit -= stream.seek(0, os.SEEK_END)
+            stream.seek(0)
             trajectories.append(_read_csv(file, stream, layout))
     return Recordings(layout, trajectories, rate, {"demo_id": np.array([file.stem for file in files])})
 
@@ -142,7 +143,7 @@ def _places(header: list[str], dofs: tuple[str, ...]) -> list[int]:
             raise ValueError(f"the header names {name!r} more than once")
     missing = [dof for dof in dofs if dof not in places]
     if missing:
-        raise ValueError(f"the header lacks {', '.join(missing)}")
+        raise ValueError(f"the header lacks {', '.join(name[:80] for name in missing[:10])}")
     return [places[dof] for dof in dofs]
 
 

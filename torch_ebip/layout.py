@@ -134,4 +134,4 @@ class Layout:
 def _reject_repeats(what: str, names: Sequence[str]) -> None:
     repeated = sorted(name for name, count in Counter(names).items() if count > 1)
     if repeated:
-        raise ValueError(f"{what} named more than once: {', '.join(repeated)}")
+        raise ValueError(f"{what} named more than once: {', '.join(repeated[:10])}")

@@ -129,7 +129,7 @@ def _layout(arrays: Mapping[str, Array]) -> Layout:
     modalities = []
     for name, columns in places.items():
         if columns != list(range(columns[0], columns[-1] + 1)):
-            raise ValueError(f"the columns of modality {name!r} are not side by side: {columns}")
+            raise ValueError(f"the columns of modality {name!r} are not side by side: {columns[:10]}")
         units = {unit[i] for i in columns}
         controllers = {controlled[i] for i in columns}
         if len(units) != 1 or len(controllers) != 1:

@@ -72,7 +72,7 @@ def chain_of_joints(text: str, end_link: str) -> tuple[str, list[UrdfJoint]]:
     robot = _parse(text)
     names = [link.get("name", "") for link in robot.findall("link")]
     if end_link not in names:
-        known = ", ".join(name[:80] for name in names[:100])
+        known = ", ".join(name[:80] for name in names[:20])
         raise ValueError(f"end_link: expected one of the URDF's links ({known}), got {end_link!r}")
     # From the end link up to the root: only these joints matter, whatever else hangs on the robot.
     above: dict[str, ElementTree.Element] = {}
