@@ -1,0 +1,1 @@
+"""Feed every reader of files with damaged and hostile ones."""
