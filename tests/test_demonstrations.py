@@ -1,6 +1,9 @@
 import json
 import math
+import os
 import pickle
+import time
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +12,7 @@ import torch
 
 from tests.conftest import interactions, layout
 from torch_ebip import Demonstrations
+from torch_ebip.files import open_file
 
 
 def equal(a: Demonstrations, b: Demonstrations) -> bool:
@@ -101,6 +105,14 @@ def test_pickles_are_refused_and_not_run(tmp_path: Path, demonstrations: Demonst
         ({"modality": np.array(["hand", "gaze", "hand", "arm", "arm"])}, "not side by side"),
         ({"unit": np.array(["m", "rad", "rad", "rad", "rad"])}, "must have one unit"),
         ({"release": np.zeros(3)}, "column 'release'"),
+        ({"release": np.zeros(24, dtype="i4,f8")}, "neither numbers nor strings"),
+        ({"lengths": np.array([2**63, 2**63, 969], dtype=np.uint64)}, "lengths add up to"),
+        ({"lengths": np.array([0] * 10**6)}, "lengths must be counts"),
+        ({"values": np.zeros((9, 5), dtype=np.longdouble)}, "at most 64 bits"),
+        ({"controlled": np.array(["False"] * 5)}, "controlled must hold booleans"),
+        ({"dofs": np.array([b"a", b"b", b"c", b"d", b"e"])}, "dofs must hold strings"),
+        ({"dofs": np.array([0x7FFFFFFF, 1, 2, 3, 4], dtype="<u4").view("<U1")}, "characters that do not exist"),
+        ({"lengths": np.array([9]), "values": np.zeros((9, 10**6), dtype="f4")}, "expected at most 100000 of each"),
     ],
 )
 def test_arrays_that_contradict_each_other(
@@ -111,6 +123,66 @@ def test_arrays_that_contradict_each_other(
     np.savez(path, **{**np.load(path), **change})
     with pytest.raises(ValueError, match=message):
         Demonstrations.load(path)
+
+
+@pytest.mark.parametrize("dtype", [">f4", "<f2", ">f8"])
+def test_floats_of_other_machines_are_read(tmp_path: Path, demonstrations: Demonstrations, dtype: str) -> None:
+    path = tmp_path / "big.npz"
+    demonstrations.save(path)
+    arrays = dict(np.load(path))
+    np.savez(path, **{**arrays, "values": arrays["values"].astype(dtype)})
+    read = Demonstrations.load(path)
+    assert read[1].dtype == (torch.float64 if dtype == ">f8" else torch.float32)
+    torch.testing.assert_close(read[1].float(), demonstrations[1], atol=2e-3, rtol=0)
+
+
+def rezip(path: Path, **members: bytes) -> None:
+    """Other members in an archive."""
+    with zipfile.ZipFile(path) as archive:
+        content = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in {**content, **members}.items():
+            archive.writestr(name, data)
+
+
+def test_archives_are_looked_through_before_they_are_unpacked(tmp_path: Path, demonstrations: Demonstrations) -> None:
+    path = tmp_path / "bomb.npz"
+    demonstrations.save(path)
+    size = sum(array.nbytes for array in np.load(path).values())
+    with pytest.raises(ValueError, match=r"bomb\.npz: .* bytes unpacked, expected at most"):
+        Demonstrations.load(path, limit=size)
+    whole = path.read_bytes()
+    for content in (b"MZ" + whole, whole + b"more", whole[:-2] + b"\1\0x"):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"bomb\.npz: .*zip archive"):
+            Demonstrations.load(path)
+    for shape in ("(1000000000000, 5)", "(-3, -5)", "(0, 1000000000000000000)"):
+        header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}}}\n".encode()
+        path.write_bytes(whole)
+        data = b"" if shape.startswith("(0") else bytes(60)
+        rezip(path, **{"values.npy": b"\x93NUMPY\1\0" + len(header).to_bytes(2, "little") + header + data})
+        with pytest.raises(ValueError, match=r"bomb\.npz: .*(bytes, expected|demonstrations of|lengths add up)"):
+            Demonstrations.load(path)
+    path.write_bytes(whole)
+    rezip(path, **{"notes.txt": b"hello"})
+    with pytest.raises(ValueError, match="is no array"):
+        Demonstrations.load(path)
+
+
+def test_only_regular_files_are_opened(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "loop").symlink_to("loop")
+    for name in ("fifo", "loop", ".", "/dev/zero", "a\0b"):
+        with pytest.raises(ValueError, match=r"expected a regular file|cannot be opened"):
+            open_file(tmp_path / name, 10)
+    with pytest.raises(FileNotFoundError):
+        open_file(tmp_path / "none", 10)
+    (tmp_path / "large").write_bytes(bytes(11))
+    with pytest.raises(ValueError, match="11 bytes, expected at most 10"):
+        open_file(tmp_path / "large", 10)
+    (tmp_path / "link").symlink_to("large")
+    with open_file(tmp_path / "link", 11) as file:
+        assert len(file.read()) == 11
 
 
 def test_a_missing_array_is_named(tmp_path: Path) -> None:
@@ -207,11 +279,63 @@ def test_the_description_may_be_json(tmp_path: Path) -> None:
         (TOML, "1,2,3\n", r"b\.csv:2: 3 cells, the header has 4"),
         (TOML, "1,2,3,x\n", r"b\.csv:2: column 'hand.y': 'x' is not a number"),
         (TOML, "", "demonstration 1 has 0 samples|no measured value"),
+        (TOML.replace('["arm.1"]', '"arm"'), "", "dofs must be of type list"),
+        (TOML.replace('["arm.1"]', "[1]"), "", "dofs must be a list of names"),
+        (TOML.replace("rate = 50", "rate = true"), "", "rate must be of type float"),
+        (TOML.replace("controlled = true", 'controlled = "false"'), "", "controlled must be of type bool"),
+        (TOML.replace("[[modalities]]", "[modalities.x]", 1).split("[[")[0], "", "modalities must be of type list"),
+        (TOML + "x = " + "[" * 10_000, "", r"layout\.toml"),
+        (TOML + ".".join("x" * 30_000) + " = 1", "", r"layout\.toml: a key of more than 16 parts"),
+        (TOML.replace("arm.1", "hand.x"), "", r"layout\.toml: DoF named more than once"),
+        (TOML, f"1,2,3,{'4' * 200_000}\n", r"b\.csv:2: field larger"),
+        (TOML, '"\n",' * 5_000_000, r"b\.csv:\d+: a row of more than"),
+        (TOML.replace("hand.y", "ignored"), "1,2,3,4\n", r"a\.csv:1: the header lacks ignored"),
     ],
 )
 def test_a_folder_that_does_not_say_enough(tmp_path: Path, description: str, body: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Demonstrations.load_folder(folder(tmp_path, description, body))
+
+
+def test_a_description_in_json_holds_the_right_types(tmp_path: Path) -> None:
+    folder(tmp_path)
+    (tmp_path / "layout.toml").unlink()
+    for text in (
+        "[]",
+        "3",
+        "[" * 100_000,
+        '{"rate": 1' + "0" * 400 + ', "modalities": []}',
+        '{"rate": 5, "modalities": [1]}',
+    ):
+        (tmp_path / "layout.json").write_text(text)
+        with pytest.raises(ValueError, match=r"layout\.json: "):
+            Demonstrations.load_folder(tmp_path)
+
+
+def test_tables_that_are_not_what_they_seem(tmp_path: Path) -> None:
+    folder(tmp_path)
+    for content, message in (
+        (b"hand.x,arm.1,hand.y\n1,2,\xff\n", "utf-8"),
+        (b"hand.x,arm.1,hand.y,hand.x\n1,2,3,4\n", "names 'hand.x' more than once"),
+    ):
+        (tmp_path / "b.csv").write_bytes(content)
+        with pytest.raises(ValueError, match=rf"b\.csv:\d+: .*{message}"):
+            Demonstrations.load_folder(tmp_path)
+    (tmp_path / "b.csv").unlink()
+    with pytest.raises(ValueError, match=r"a\.csv: 38 bytes, expected at most 20"):
+        Demonstrations.load_folder(tmp_path, limit=20)
+
+
+def test_a_million_columns_take_linear_time(tmp_path: Path) -> None:
+    folder(tmp_path)
+    dofs = [f"d{i}" for i in range(20_000)]
+    (tmp_path / "layout.toml").write_text(TOML.replace('["arm.1"]', json.dumps(dofs)))
+    for name in ("a", "b"):
+        head = ",".join(["hand.x", "hand.y", *(f"x{i}" for i in range(200_000)), *dofs])
+        (tmp_path / f"{name}.csv").write_text(head + 2 * ("\n" + "1," * 220_001 + "1"))
+    began = time.process_time()
+    assert Demonstrations.load_folder(tmp_path).layout.n_dofs == 20_002
+    assert time.process_time() - began < 20  # a minute and more, if each name is looked for in all
 
 
 def test_an_empty_folder(tmp_path: Path) -> None:

@@ -3,7 +3,8 @@ from pathlib import Path
 
 import pytest
 
-from experiments.run_folder import RunFolder, write_json
+from experiments.folds import read_values
+from experiments.run_folder import RunFolder, read_json, write_json
 
 
 def test_a_new_run_says_everything_needed(tmp_path: Path) -> None:
@@ -54,3 +55,19 @@ def test_other_files_are_left_alone(tmp_path: Path) -> None:
     with pytest.raises(SystemExit, match="cannot be written"):
         RunFolder("tune", {}, "/proc/nowhere/run")
     assert (tmp_path / "thesis.tex").read_text() == "mine"
+
+
+@pytest.mark.parametrize("text", ["", "{", "[" * 100_000, "\xff", "1" * 5000])
+def test_damaged_json_is_named(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.json").write_text(text, encoding="latin-1")
+    with pytest.raises(ValueError, match=r"a\.json"):
+        read_json(tmp_path / "a.json")
+    with pytest.raises(FileNotFoundError):
+        read_json(tmp_path / "none.json")
+
+
+@pytest.mark.parametrize("content", [3, [3], [{}], [{"values": {"a": [1]}}], [{"values": {"a": [1], "b": [1, 2]}}]])
+def test_what_is_no_fold_is_named(tmp_path: Path, content: object) -> None:
+    write_json(tmp_path / "a.json", content)
+    with pytest.raises(ValueError, match=r"a\.json: not the values of a fold"):
+        read_values(tmp_path / "a.json")

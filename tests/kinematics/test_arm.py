@@ -187,6 +187,58 @@ def test_errors_say_what_was_expected_and_what_came(tmp_path) -> None:  # type: 
         RobotArm(TWO_LINKS.replace("continuous", "floating"), "tip")
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"0.5 0 0"', '"nan 0 0"', "joint 'j2': expected a finite number, got 'nan'"),
+        ('"0.5 0 0"', '"1e300 0 0"', "joint 'j2': expected a finite number"),
+        ('rpy="0 0 0"', 'rpy="0 inf 0"', "joint 'j2': expected a finite number"),
+        ('"0.5 0 0"', '"0.5 0"', "expected three numbers in xyz"),
+        ('<axis xyz="0 0 1"/><limit', '<axis xyz="0 0 0"/><limit', "expected an axis with a direction"),
+        ('upper="2"', 'upper="nan"', "joint 'j2': expected a finite number"),
+        ('upper="2"', 'upper="-2"', "expected limits, got -1.0 to -2.0"),
+        ('velocity="3"', "", "joint 'j2': expected a finite number"),
+        ('name="j2"', 'name="j1"', "joints of different names"),
+        ('<child link="side"/>', '<child link="tip"/>', "two joints above 'tip'"),
+        ("<robot", "<sdf", "does not parse"),
+    ],
+)
+def test_numbers_that_give_no_pose_are_refused(old: str, new: str, message: str) -> None:
+    assert old in TWO_LINKS
+    with pytest.raises(ValueError, match=f"urdf: .*{message}"):
+        RobotArm(TWO_LINKS.replace(old, new), "tip")
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16", "utf-7"])
+def test_entities_are_refused_in_any_encoding(tmp_path, encoding: str) -> None:  # type: ignore[no-untyped-def]
+    path = tmp_path / "evil.urdf"
+    evil = f'<?xml version="1.0" encoding="{encoding}"?><!DOCTYPE r [<!ENTITY tip SYSTEM "file:///etc/passwd">]>'
+    path.write_bytes((evil + TWO_LINKS.strip().replace('"tip"', '"&tip;"')).encode(encoding))
+    with pytest.raises(ValueError, match="urdf: "):
+        RobotArm(path, "tip")
+
+
+def test_a_joint_without_an_axis_turns_about_x() -> None:
+    arm = RobotArm(TWO_LINKS.replace('<axis xyz="0 0 1"/>', ""), "tip")
+    turned = arm(torch.tensor([math.pi / 2, 0.0]))
+    torch.testing.assert_close(turned[:3, 0], torch.tensor([1.0, 0.0, 0.0]))
+
+
+@pytest.mark.parametrize(("count", "works"), [(100, True), (101, False), (20_000, False)])
+def test_chains_are_as_long_as_can_be_copied(count: int, works: bool) -> None:
+    links = "".join(f'<link name="{i}"/>' for i in range(count + 1))
+    joints = "".join(
+        f'<joint name="j{i}" type="continuous"><parent link="{i}"/><child link="{i + 1}"/></joint>'
+        for i in range(count)
+    )
+    text = f"<robot>{links}{joints}</robot>"
+    if works:
+        assert RobotArm(text, str(count))(torch.zeros(count)).isfinite().all()
+    else:
+        with pytest.raises(ValueError, match="urdf: expected a tree of at most 100 joints"):
+            RobotArm(text, str(count))
+
+
 def test_building_an_arm_is_quiet_and_importing_is_light() -> None:
     script = (
         "import sys, torch; before = torch.random.get_rng_state(); import torch_ebip.kinematics as k;"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -122,6 +123,7 @@ def test_what_is_no_recording_is_named(text: str, message: str, tmp_path: Path) 
         '["advance", "soon"]',
         "{}",
         "[[1]]",
+        f'["forecast", 0.1, {[0.1] * 20_000}, [[0.0]]]',
         f'["advance", 1{"0" * 400}]',
     ],
 )
@@ -144,6 +146,8 @@ def test_damaged_settings_are_named(tmp_path: Path) -> None:
         3,
         {**good, "window": "wide"},
         {**good, "window": math.inf},
+        {**good, "window": 1e9},
+        {**good, "longest_gap": 1e12},
         {**good, "record": str(evil)},
     ):
         header: dict[str, Any] = {**json.loads(lines[0]), "settings": settings}
@@ -151,6 +155,13 @@ def test_damaged_settings_are_named(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match="settings of the session are damaged"):
             replay(tmp_path / "bad.jsonl", filters()["ebip with options"], primitive())
     assert not evil.exists()
+
+
+def test_a_recording_that_is_no_file_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "log.jsonl")
+    for path in (tmp_path / "log.jsonl", tmp_path, "/dev/zero", "/proc/self/mem"):
+        with pytest.raises(ValueError, match=r"expected a regular file|cannot be opened|not a recording"):
+            replay(path, filters()["ebip"], primitive())
 
 
 def test_what_the_session_refused_does_not_spoil_its_recording(tmp_path: Path) -> None:
