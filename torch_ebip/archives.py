@@ -86,6 +86,10 @@ def _check_ends(path: str | os.PathLike[str], file: IO[bytes]) -> None:
 def read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> npt.NDArray[Any]:
     """An array of numbers, strings or times; nothing is allocated before its header agrees with its size.
 
+    Args:
+        archive: as `open_archive` opened it.
+        member: of it, an array [...] in numpy's format.
+
     Raises:
         ValueError: another kind of array, or a header that says something else than what follows.
         Exception: whatever `zipfile` and `zlib` raise on damaged bytes.

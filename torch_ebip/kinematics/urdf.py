@@ -85,10 +85,10 @@ def chain_of_joints(text: str, end_link: str) -> tuple[str, list[UrdfJoint]]:
     while link in above:
         path.append(above[link])
         link = _link(path[-1], "parent")
+        if any(above[link] is joint for joint in path if link in above):
+            raise ValueError(f"urdf: expected a tree of links, got a loop through {link!r}")
         if len(path) > MOST_JOINTS:
-            raise ValueError(
-                f"urdf: expected a tree of at most {MOST_JOINTS} joints, got more, or a loop through {link!r}"
-            )
+            raise ValueError(f"urdf: expected at most {MOST_JOINTS} joints from the root to {end_link!r}, got more")
     unsupported = [_name(joint) for joint in path if joint.get("type") not in TYPES]
     if unsupported:
         raise ValueError(
