@@ -17,6 +17,7 @@ from pathlib import Path
 
 import torch
 
+from experiments.command_line import add_data_options, add_run_options, command, experiment_parser
 from experiments.data import choose_subsets, load, thinning
 from experiments.entries import METHODS, Fold
 from experiments.evaluate import evaluate
@@ -24,7 +25,7 @@ from experiments.figures import results_figure
 from experiments.folds import LOST, mean_of_cells, read_values, run_folds, share_cores, split, write_values
 from experiments.paper_table import paper_rows
 from experiments.results import Values, markdown, print_tables, summarise
-from experiments.run_folder import RunFolder, read_json, write_json
+from experiments.run_folder import RunFolder, read_json, save_figure, write_json
 from torch_ebip.files import atomic_write
 from torch_ebip.ranks import RankLostError, Ranks
 from torch_ebip.tuning import TuningSettings
@@ -77,6 +78,7 @@ def run_fold(job: Job) -> Values:
     return merged
 
 
+@command
 def main(arguments: list[str] | None = None) -> None:
     """Run the experiment from the command line."""
     options = _parser().parse_args(arguments)
@@ -112,7 +114,7 @@ def main(arguments: list[str] | None = None) -> None:
         "scan": scan,
         "tuning": asdict(tuning),
     }
-    run = ranks.from_first(lambda: RunFolder("compare", settings, options.out, options.force))
+    run = ranks.from_first(lambda: RunFolder("compare", settings, options.out, options.force, arguments))
     ranks.explain_on_termination(LOST.format(run.path))
     workers, threads = share_cores(folds, options.workers)
     threads = threads if ranks.size == 1 else torch.get_num_threads()
@@ -163,21 +165,16 @@ def main(arguments: list[str] | None = None) -> None:
     panels.append(("coverage_95", task.targets[0]))
     with atomic_write(run.path / "results.md") as file:
         file.write(markdown(results).encode())
-    results_figure(results, panels).savefig(run.path / "results.png", dpi=110)
-    write_json(run.results, results)
+    save_figure(results_figure(results, panels), run.path / "results.png")
+    run.finish(results)
     print_tables(results, only=panels)
     print(f"all tables: {run.path / 'results.md'}")
     print(f"{results['seconds']:.0f} s; written to {run.path}")
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m experiments.compare",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--data", metavar="FILE.npz", help="recordings in the project's format (default: simulated)")
-    parser.add_argument("--demonstrations", type=int, default=221, metavar="N", help="simulated ones (default: 221)")
+    parser = experiment_parser("compare", __doc__)
+    add_data_options(parser)
     parser.add_argument("--folds", type=int, default=10, help="of the cross-validation (default: 10)")
     parser.add_argument(
         "--methods", nargs="+", choices=list(METHODS), default=list(METHODS), metavar="METHOD",
@@ -192,13 +189,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--steps", type=int, default=40, help="gradient steps of a tuned filter at most (default: 40)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of data, splits and draws (default: 0)")
-    parser.add_argument("--quick", action="store_true", help="a small run of a few minutes, to see that all works")
-    parser.add_argument("--workers", type=int, help="processes for folds without torchrun (default: one a core)")
-    parser.add_argument(
-        "--out", metavar="DIR", help="run folder (default: runs/compare/STAMP); resumes an unfinished run"
-    )
-    parser.add_argument("--force", action="store_true", help="start over, also where --out holds a finished run")
+    add_run_options(parser, "compare", "data, splits and draws", "a small run of a few minutes", workers=True)
     return parser
 
 

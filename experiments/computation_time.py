@@ -21,13 +21,14 @@ from rich.table import Table
 from torch import Tensor
 from tqdm import tqdm
 
+from experiments.command_line import add_data_options, add_run_options, command, experiment_parser
 from experiments.data import load, thinning
 from experiments.entries import METHODS, Fold
 from experiments.evaluate import FilterMethod, evaluate
 from experiments.figures import colour
 from experiments.folds import mean_of_cells, split
 from experiments.methods import FACTORS, best_factor, scaled
-from experiments.run_folder import RunFolder, write_json
+from experiments.run_folder import RunFolder, save_figure
 from torch_ebip import Filter, ebip
 from torch_ebip.tuning import TuningSettings
 
@@ -102,6 +103,7 @@ def figure(by_length: Sequence[Mapping[str, Any]], by_members: Sequence[Mapping[
     return made
 
 
+@command
 def main(arguments: list[str] | None = None) -> None:
     """Run the experiment from the command line."""
     options = _parser().parse_args(arguments)
@@ -117,7 +119,7 @@ def main(arguments: list[str] | None = None) -> None:
         "repeats": repeats,
         "seeds": seeds,
     }
-    run = RunFolder("computation_time", settings, options.out, options.force)
+    run = RunFolder("computation_time", settings, options.out, options.force, arguments)
     print(demonstrations)
     training, testing = split(len(demonstrations), 1, 0, options.seed)
     known, tests = demonstrations.subset(training), demonstrations.subset(testing)
@@ -184,8 +186,8 @@ def main(arguments: list[str] | None = None) -> None:
         "target": {"modality": target, "unit": unit, "observed": FRACTION},
         "seconds": round(time.monotonic() - began, 1),
     }
-    figure(by_length, by_members, unit).savefig(run.path / "computation_time.png", dpi=110)
-    write_json(run.results, results)
+    save_figure(figure(by_length, by_members, unit), run.path / "computation_time.png")
+    run.finish(results)
     _print(results)
     print(f"{results['seconds']:.0f} s; written to {run.path}")
 
@@ -222,18 +224,10 @@ def _print(results: Mapping[str, Any]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m experiments.computation_time",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--data", metavar="FILE.npz", help="recordings in the project's format (default: simulated)")
-    parser.add_argument("--demonstrations", type=int, default=221, metavar="N", help="simulated ones (default: 221)")
+    parser = experiment_parser("computation_time", __doc__)
+    add_data_options(parser)
     parser.add_argument("--repeats", type=int, default=5, help="of each timing, beside one to warm up (default: 5)")
-    parser.add_argument("--seed", type=int, default=0, help="of data, splits and draws (default: 0)")
-    parser.add_argument("--quick", action="store_true", help="a small run, to see that all works")
-    parser.add_argument("--out", metavar="DIR", help="run folder (default: runs/computation_time/STAMP)")
-    parser.add_argument("--force", action="store_true", help="start over, also where --out holds a finished run")
+    add_run_options(parser, "computation_time", "data, splits and draws", "a small run", resumes=False)
     return parser
 
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -33,10 +35,29 @@ def split(count: int, folds: int, fold: int, seed: int, test: float = 0.2) -> tu
 
 
 def share_cores(folds: int, workers: int | None) -> tuple[int, int]:
-    """Processes for the folds, one a core unless told otherwise, and threads for each."""
-    cores = os.cpu_count() or 1
-    processes = max(1, min(workers or cores, folds))
-    return processes, max(1, cores // processes)
+    """Processes for the folds, one a core unless told otherwise, and threads for each.
+
+    Threads are those that torch has, which OMP_NUM_THREADS says: with 1, a run gives the same bits again.
+    """
+    processes = max(1, min(workers or os.cpu_count() or 1, folds))
+    return processes, max(1, torch.get_num_threads() // processes)
+
+
+def end_with_parent() -> None:
+    """Have this process end when the one that started it does, however that ends.
+
+    Nobody would take its results, and a run that goes on must not find it still writing to its folder.
+    """
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def wait_for_it() -> None:
+        """Then end, without a word."""
+        wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=wait_for_it, daemon=True).start()
 
 
 def run_folds(
@@ -68,7 +89,7 @@ def run_folds(
         return merge([shares[i % ranks.size][i // ranks.size] for i in range(len(jobs))])
     parts: list[Values] = [{} for _ in jobs]
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=end_with_parent) as pool:
         futures = {pool.submit(run, job): i for i, job in enumerate(jobs)}
         with tqdm(total=len(jobs), desc="folds", unit="fold", dynamic_ncols=True) as bar:
             try:

@@ -20,6 +20,7 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
+from experiments.command_line import add_data_options, add_run_options, command, experiment_parser
 from experiments.data import FRACTIONS, load, thinning
 from experiments.evaluate import FilterMethod, MeanMethod, NearestMethod, evaluate
 from experiments.figures import forecast_figure, noise_figure, results_figure
@@ -35,9 +36,10 @@ from experiments.folds import (
 )
 from experiments.methods import FACTORS, Problem, best_factor, best_start, keep, scaled, tunable, tune
 from experiments.results import Values, print_tables, summarise
-from experiments.run_folder import RunFolder, read_json, write_json
+from experiments.run_folder import RunFolder, read_json, save_figure, write_json
 from torch_ebip import InteractionPrimitive, select_basis
 from torch_ebip.basis import rank_candidates, selection_table
+from torch_ebip.files import atomic_write
 from torch_ebip.monitor import Monitor
 from torch_ebip.ranks import RankLostError, Ranks
 from torch_ebip.tuning import TuningSettings
@@ -88,7 +90,8 @@ def run_fold(
             config = {**asdict(job), "tuning": None, **asdict(job.tuning)}
             monitor.text("configuration", "\n".join(f"- `{key}`: {value}" for key, value in config.items()))
             choice = selection_table(ranking)
-            (folder / "basis.txt").write_text(f"{choice}\n")
+            with atomic_write(folder / "basis.txt") as file:
+                file.write(f"{choice}\n".encode())
             monitor.text("basis", f"```\n{choice}\n```")
         factor = best_factor(problem, scaled, job.tuning, job.scan, FACTORS, folder / "scan_scaled.json")
         start = best_start(problem, job.tuning, job.scan, factor, folder / "scan_tunable.json")
@@ -110,9 +113,9 @@ def run_fold(
             figure = forecast_figure({name: filters[name]}, tests, 0, sensors, shown, FRACTIONS)
             monitor.figure("forecast", figure, step)
         pair = {name: filters[name] for name in ("ebip", "ebip_tuned")}
-        forecast_figure(pair, tests, 0, sensors, shown, FRACTIONS).savefig(folder / "forecasts.png", dpi=110)
+        save_figure(forecast_figure(pair, tests, 0, sensors, shown, FRACTIONS), folder / "forecasts.png")
         seen = [name for name in layout.names if not layout[name].controlled]
-        noise_figure(tuned, primitive.residual_variance.cpu(), layout, seen).savefig(folder / "noise.png", dpi=110)
+        save_figure(noise_figure(tuned, primitive.residual_variance.cpu(), layout, seen), folder / "noise.png")
         summary = summarise(answers, "ebip_tuned")["summary"]
         final = {
             f"final/{row['metric']}/{row['modality'] or 'all'}": row["mean"]
@@ -137,6 +140,7 @@ def run_fold(
     return answers
 
 
+@command
 def main(arguments: list[str] | None = None) -> None:
     """Run the experiment from the command line."""
     options = _parser().parse_args(arguments)
@@ -169,7 +173,7 @@ def main(arguments: list[str] | None = None) -> None:
             f"{len(demonstrations)} demonstrations with {held} held out are too few: tuning filters each of the "
             f"others by the rest in {tuning.folds} folds, and needs {2 * tuning.folds} of them"
         )
-    run = ranks.from_first(lambda: RunFolder("tune", settings, options.out, options.force))
+    run = ranks.from_first(lambda: RunFolder("tune", settings, options.out, options.force, arguments))
     ranks.explain_on_termination(LOST.format(run.path))
     workers, threads = share_cores(options.folds, options.workers)
     threads = threads if ranks.size == 1 else torch.get_num_threads()
@@ -207,8 +211,8 @@ def main(arguments: list[str] | None = None) -> None:
     if task.arm is not None:
         panels = [("mse", "robot"), ("mae", "ball"), ("tool_error", None)]
     panels.append(("coverage_95", task.targets[0]))
-    write_json(run.results, results)
-    results_figure(results, panels).savefig(run.path / "results.png", dpi=110)
+    save_figure(results_figure(results, panels), run.path / "results.png")
+    run.finish(results)
     print_tables(results)
     for report in results["reports"][:1]:
         print(f"state: {report['n_weights']} weights; factor on R: {report['factor_scaled']:.3g} (ebip_scaled)")
@@ -233,22 +237,13 @@ def _headline(values: Values) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m experiments.tune", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--data", metavar="FILE.npz", help="recordings in the project's format (default: simulated)")
-    parser.add_argument("--demonstrations", type=int, default=221, metavar="N", help="simulated ones (default: 221)")
+    parser = experiment_parser("tune", __doc__)
+    add_data_options(parser)
     parser.add_argument(
         "--folds", type=int, default=1, help="cross-validation; 1 holds out a fifth once (default: 1)"
     )
     parser.add_argument("--steps", type=int, default=100, help="gradient steps at most (default: 100)")
-    parser.add_argument("--seed", type=int, default=0, help="of data, splits and draws (default: 0)")
-    parser.add_argument("--quick", action="store_true", help="a run of about a minute, to see that all works")
-    parser.add_argument("--workers", type=int, help="processes for folds without torchrun (default: one a core)")
-    parser.add_argument(
-        "--out", metavar="DIR", help="run folder (default: runs/tune/STAMP); resumes an unfinished run"
-    )
-    parser.add_argument("--force", action="store_true", help="start over, also where --out holds a finished run")
+    add_run_options(parser, "tune", "data, splits and draws", "a run of about a minute", workers=True)
     return parser
 
 

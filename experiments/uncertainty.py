@@ -15,13 +15,14 @@ from typing import Any
 import torch
 
 from experiments.calibration_figures import calibration_figure, error_figure
+from experiments.command_line import add_data_options, add_run_options, command, experiment_parser
 from experiments.data import load, thinning
 from experiments.entries import METHODS, Fold
 from experiments.evaluate import FilterMethod, Task, evaluate
 from experiments.folds import split
 from experiments.frames_figures import attribution_figure, frames_figure
 from experiments.results import print_tables, summarise
-from experiments.run_folder import RunFolder, write_json
+from experiments.run_folder import RunFolder, save_figure
 from torch_ebip import Demonstrations, Forecast
 from torch_ebip.tuning import TuningSettings
 
@@ -63,6 +64,7 @@ def calibration(below: torch.Tensor) -> dict[str, Any]:
     }
 
 
+@command
 def main(arguments: list[str] | None = None) -> None:
     """Run the experiment from the command line."""
     options = _parser().parse_args(arguments)
@@ -89,7 +91,7 @@ def main(arguments: list[str] | None = None) -> None:
         "interaction": options.interaction,
         "dof": dof,
     }
-    run = RunFolder("uncertainty", settings, options.out, options.force)
+    run = RunFolder("uncertainty", settings, options.out, options.force, arguments)
     print(demonstrations)
     known, tests = demonstrations.subset(training), demonstrations.subset(testing)
     fold = Fold.of(known, task, options.seed, tuning, run.path)
@@ -104,15 +106,12 @@ def main(arguments: list[str] | None = None) -> None:
     horizons = curve._replace(fractions=(0.2, 0.43, 0.6, 0.82))
     reports = {name: calibration(probabilities(methods[name], horizons, tests, target)) for name in NAMES}
     for name, filter in filters.items():
-        frames_figure(name, filter, tests[options.interaction], layout, shown, dof).savefig(
-            run.path / f"frames-{name}.png", dpi=110
-        )
-    panels = [(m, "mae") for m in task.targets]
-    error_figure(values, panels).savefig(run.path / "error.png", dpi=110)
-    calibration_figure(reports, target).savefig(run.path / "calibration.png", dpi=110)
-    attribution_figure(
-        {name: filters[name] for name in ("ebip", "ebip_tuned")}, tests[options.interaction], shown
-    ).savefig(run.path / "attribution.png", dpi=110)
+        frames = frames_figure(name, filter, tests[options.interaction], layout, shown, dof)
+        save_figure(frames, run.path / f"frames-{name}.png")
+    save_figure(error_figure(values, [(m, "mae") for m in task.targets]), run.path / "error.png")
+    save_figure(calibration_figure(reports, target), run.path / "calibration.png")
+    attributed = {name: filters[name] for name in ("ebip", "ebip_tuned")}
+    save_figure(attribution_figure(attributed, tests[options.interaction], shown), run.path / "attribution.png")
     results = {
         "experiment": "uncertainty",
         "dataset": {
@@ -124,7 +123,7 @@ def main(arguments: list[str] | None = None) -> None:
         "calibration": {"modality": target, **reports},
         "seconds": round(time.monotonic() - began, 1),
     }
-    write_json(run.results, results)
+    run.finish(results)
     few = [row for row in results["rows"] if row["observed"] in (0.2, 0.45, 0.6, 0.8, 0.95)]
     print_tables({**results, "rows": few}, only=[("mae", task.targets[-1]), ("coverage_95", target)])
     for name, report in reports.items():
@@ -134,22 +133,12 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m experiments.uncertainty",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--data", metavar="FILE.npz", help="recordings in the project's format (default: simulated)")
-    parser.add_argument("--demonstrations", type=int, default=221, metavar="N", help="simulated ones (default: 221)")
+    parser = experiment_parser("uncertainty", __doc__)
+    add_data_options(parser)
     parser.add_argument("--interaction", type=int, default=0, help="which of the held-out ones is drawn (default: 0)")
     parser.add_argument("--dof", help="which degree of freedom is drawn (default: the robot's third joint)")
     parser.add_argument("--steps", type=int, default=100, help="gradient steps at most (default: 100)")
-    parser.add_argument("--seed", type=int, default=0, help="of data, splits and draws (default: 0)")
-    parser.add_argument("--quick", action="store_true", help="a small run, to see that all works")
-    parser.add_argument(
-        "--out", metavar="DIR", help="run folder (default: runs/uncertainty/STAMP); resumes an unfinished run"
-    )
-    parser.add_argument("--force", action="store_true", help="start over, also where --out holds a finished run")
+    add_run_options(parser, "uncertainty", "data, splits and draws", "a small run")
     return parser
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -31,7 +32,8 @@ class Monitor:
         # Imported here: TensorBoard takes half a second that nobody should wait for who does not watch.
         from torch.utils.tensorboard import SummaryWriter
 
-        self._writer: Any = SummaryWriter(str(folder))
+        self.folder = str(folder)
+        self._writer: Any = SummaryWriter(self.folder)
 
     def __enter__(self) -> Monitor:
         return self
@@ -42,20 +44,20 @@ class Monitor:
     def scalars(self, values: Mapping[str, float], step: int) -> None:
         """One point at this step for each of some values; a slash in a name groups them."""
         for name, value in values.items():
-            self._writer.add_scalar(name, value, step)
+            self._send("add_scalar", name, value, step)
 
     def text(self, name: str, markdown: str) -> None:
         """A text tab of this name, written in markdown."""
-        self._writer.add_text(name, markdown)
+        self._send("add_text", name, markdown)
 
     def figure(self, name: str, figure: Figure, step: int) -> None:
         """A matplotlib figure of this name and step, which is closed."""
-        self._writer.add_figure(name, figure, step, close=True)
+        self._send("add_figure", name, figure, step, close=True)
 
     def hyperparameters(self, settings: Mapping[str, Any], metrics: Mapping[str, float]) -> None:
         """The HParams tab: settings and the final metrics they led to."""
         plain = {name: v if isinstance(v, bool | int | float | str) else str(v) for name, v in settings.items()}
-        self._writer.add_hparams(plain, dict(metrics), run_name=".")
+        self._send("add_hparams", plain, dict(metrics), run_name=".")
 
     def filter(self, filter: nn.Module, layout: Layout, step: int) -> None:
         """The constrained noise of a filter on a layout, at this step: see `noise_scalars`."""
@@ -63,7 +65,17 @@ class Monitor:
 
     def close(self) -> None:
         """Write everything out."""
-        self._writer.close()
+        self._send("close")
+
+    def _send(self, action: str, *arguments: Any, **options: Any) -> None:
+        """Have it written; a disk that fails ends the record, with a warning, and not what it is about."""
+        if self._writer is None:
+            return
+        try:
+            getattr(self._writer, action)(*arguments, **options)
+        except OSError as error:
+            self._writer = None
+            warnings.warn(f"{self.folder}: what TensorBoard shows ends here: {error}", stacklevel=3)
 
 
 def noise_scalars(filter: nn.Module, layout: Layout) -> dict[str, float]:

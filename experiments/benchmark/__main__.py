@@ -24,9 +24,11 @@ from rich.table import Table
 from tqdm import tqdm
 
 from experiments.benchmark import growth, sequences, startup, step
-from experiments.run_folder import RunFolder, write_json
+from experiments.command_line import add_run_options, command, experiment_parser
+from experiments.run_folder import RunFolder, save_figure
 
 
+@command
 def main(arguments: list[str] | None = None) -> None:
     """Run the benchmark from the command line."""
     options = _parser().parse_args(arguments)
@@ -34,7 +36,7 @@ def main(arguments: list[str] | None = None) -> None:
     rounds = 100 if options.quick else options.rounds
     samples = 20 if options.quick else sequences.SAMPLES
     settings = {"seed": options.seed, "rounds": rounds, "quick": options.quick}
-    run = RunFolder("benchmark", settings, options.out, options.force)
+    run = RunFolder("benchmark", settings, options.out, options.force, arguments)
     seed = options.seed
     sections: dict[str, Callable[[], Any]] = {
         "step": lambda: step.live_size(rounds, seed),
@@ -50,8 +52,8 @@ def main(arguments: list[str] | None = None) -> None:
             bar.set_postfix_str(name)
             results[name] = section()
     results["seconds"] = round(time.monotonic() - began, 1)
-    figure(results).savefig(run.path / "benchmark.png", dpi=110)
-    write_json(run.results, results)
+    save_figure(figure(results), run.path / "benchmark.png")
+    run.finish(results)
     _print(results)
     print(f"{results['seconds']:.0f} s; written to {run.path}")
 
@@ -133,16 +135,9 @@ def _table(title: str, heads: list[str]) -> Table:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m experiments.benchmark",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = experiment_parser("benchmark", __doc__)
     parser.add_argument("--rounds", type=int, default=1000, help="calls of each action that count (default: 1000)")
-    parser.add_argument("--seed", type=int, default=0, help="of interactions and draws (default: 0)")
-    parser.add_argument("--quick", action="store_true", help="few calls and sizes, to see that all works")
-    parser.add_argument("--out", metavar="DIR", help="run folder (default: runs/benchmark/STAMP)")
-    parser.add_argument("--force", action="store_true", help="start over, also where --out holds a finished run")
+    add_run_options(parser, "benchmark", "interactions and draws", "few calls and sizes", resumes=False)
     return parser
 
 

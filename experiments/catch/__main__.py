@@ -22,13 +22,15 @@ from experiments.catch.jobs import METHODS, Plan, as_settings, run_all
 from experiments.catch.learning import learn
 from experiments.catch.table import markdown, print_table, summarise
 from experiments.catch.throws import LATENCY
-from experiments.run_folder import RunFolder, read_json, write_json
+from experiments.command_line import add_run_options, command, experiment_parser
+from experiments.run_folder import RunFolder, read_json
 from torch_ebip.files import atomic_write
 
 GROUPS = {"imu": ("imu_acceleration", "imu_gyro"), "shoes": ("shoe_left", "shoe_right")}
 """Names of sensors that are one object, beside the single ones."""
 
 
+@command
 def main(arguments: list[str] | None = None) -> None:
     """Run the experiment from the command line."""
     options = _parser().parse_args(arguments)
@@ -45,7 +47,7 @@ def main(arguments: list[str] | None = None) -> None:
     plan = Plan("", throws, demonstrations, options.seed, lead, options.arm, sensors, share)
     settings = {**as_settings(plan, methods), "steps": steps, "filter": options.filter}
     taken = {} if options.filter is None else _take(Path(options.filter), plan)
-    run = RunFolder("catch", settings, options.out, options.force)
+    run = RunFolder("catch", settings, options.out, options.force, arguments)
     plan = Plan(str(run.path), throws, demonstrations, options.seed, lead, options.arm, sensors, share)
     if options.filter is None:
         with tqdm(total=steps, desc="tuning", unit="step", dynamic_ncols=True) as bar:
@@ -71,7 +73,7 @@ def main(arguments: list[str] | None = None) -> None:
     with atomic_write(run.path / "results.md") as file:
         file.write(markdown(summary).encode())
     summary["seconds"] = round(time.monotonic() - began, 1)
-    write_json(run.results, summary)
+    run.finish(summary)
     print_table(summary)
     print(f"{summary['seconds']:.0f} s; written to {run.path}")
 
@@ -127,9 +129,7 @@ def _take(source: Path, plan: Plan) -> dict[str, bytes]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m experiments.catch", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = experiment_parser("catch", __doc__)
     parser.add_argument("--throws", type=int, default=200, metavar="N", help="for each condition (default: 200)")
     parser.add_argument(
         "--methods",
@@ -156,14 +156,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--demonstrations", type=int, default=221, metavar="N", help="to learn from (default: 221)")
     parser.add_argument("--steps", type=int, default=100, help="gradient steps at most (default: 100)")
     parser.add_argument("--filter", metavar="RUN", help="take the tuned filter of another run of this experiment")
-    parser.add_argument("--seed", type=int, default=0, help="of demonstrations, throws and draws (default: 0)")
-    parser.add_argument("--quick", action="store_true", help="a run of a minute or two, to see that all works")
     parser.add_argument("--no-pictures", action="store_true", help="neither the strip nor the animation")
-    parser.add_argument("--workers", type=int, help="processes (default: one a core)")
-    parser.add_argument(
-        "--out", metavar="DIR", help="run folder (default: runs/catch/STAMP); resumes an unfinished run"
-    )
-    parser.add_argument("--force", action="store_true", help="start over, also where --out holds a finished run")
+    add_run_options(parser, "catch", "demonstrations, throws and draws", "a run of a minute or two", workers=True)
     return parser
 
 

@@ -25,6 +25,7 @@ from experiments.catch.controllers import (
 from experiments.catch.learning import filters, know
 from experiments.catch.throws import CONDITIONS, Toss, draw
 from experiments.catch.trial import Drop, Outcome, run
+from experiments.folds import end_with_parent
 from experiments.run_folder import read_json, write_json
 from torch_ebip import Filter, InteractionPrimitive
 
@@ -146,7 +147,7 @@ def run_all(plan: Plan, methods: Sequence[str], workers: int) -> Results:
     done: dict[Portion, list[dict[str, Any]]] = {}
     context = multiprocessing.get_context("spawn")
     with (
-        ProcessPoolExecutor(workers, mp_context=context) as pool,
+        ProcessPoolExecutor(workers, mp_context=context, initializer=end_with_parent) as pool,
         tqdm(
             total=plan.throws * len(methods) * len(CONDITIONS), desc="throws", unit="throw", dynamic_ncols=True
         ) as bar,

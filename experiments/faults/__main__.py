@@ -16,13 +16,14 @@ from dataclasses import replace
 
 from tqdm import tqdm
 
+from experiments.command_line import add_data_options, add_run_options, command, experiment_parser
 from experiments.faults.faults import GROUPS
 from experiments.faults.jobs import METHODS, PORTION, Job, Plan, Study, run_portion
 from experiments.faults.picture import faults_figure
 from experiments.faults.table import markdown, print_table, summarise
 from experiments.folds import run_folds, share_cores
 from experiments.results import Values
-from experiments.run_folder import RunFolder, write_json
+from experiments.run_folder import RunFolder, save_figure
 from torch_ebip.files import atomic_write
 
 DEFAULT = ("ebip_tuned", "tuned_student", "ebip", "ebip_student", "particle_filter", "bip")
@@ -30,6 +31,7 @@ STARTS = (0.2, 0.43, 0.6)
 """Shares of an interaction at which sensors are lost: before, in and after the wind-up."""
 
 
+@command
 def main(arguments: list[str] | None = None) -> None:
     """Run the experiment from the command line."""
     options = _parser().parse_args(arguments)
@@ -42,7 +44,7 @@ def main(arguments: list[str] | None = None) -> None:
     groups = None if options.faults is None else tuple(dict.fromkeys(["clean", *options.faults]))
     plan = Plan("", options.data, count, tests, tuple(options.methods), groups, starts, options.members, options.seed)
     study = Study(plan)
-    run = RunFolder("faults", {**plan.settings(), "steps": steps}, options.out, options.force)
+    run = RunFolder("faults", {**plan.settings(), "steps": steps}, options.out, options.force, arguments)
     study.plan = plan = replace(plan, folder=str(run.path))
     print(study.known)
     if any("tuned" in name for name in plan.methods):
@@ -76,20 +78,17 @@ def main(arguments: list[str] | None = None) -> None:
         **summarise(run_folds(run_portion, jobs, workers, headline), study.faults, target, plan.seed),
         "seconds": round(time.monotonic() - began, 1),
     }
-    faults_figure(results, plan.methods[0]).savefig(run.path / "faults.png", dpi=110)
+    save_figure(faults_figure(results, plan.methods[0]), run.path / "faults.png")
     with atomic_write(run.path / "results.md") as file:
         file.write(markdown(results).encode())
-    write_json(run.results, results)
+    run.finish(results)
     print_table(results)
     print(f"{results['seconds']:.0f} s; written to {run.path}")
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m experiments.faults", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--data", metavar="FILE.npz", help="recordings in the project's format (default: simulated)")
-    parser.add_argument("--demonstrations", type=int, default=221, metavar="N", help="simulated ones (default: 221)")
+    parser = experiment_parser("faults", __doc__)
+    add_data_options(parser)
     parser.add_argument("--tests", type=int, default=44, metavar="N", help="held-out interactions (default: 44)")
     parser.add_argument(
         "--methods", nargs="+", choices=list(METHODS), default=list(DEFAULT), metavar="METHOD",
@@ -101,13 +100,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--members", type=int, default=80, metavar="E", help="of ensembles (default: 80)")
     parser.add_argument("--steps", type=int, default=100, help="gradient steps at most (default: 100)")
-    parser.add_argument("--seed", type=int, default=0, help="of data, faults and draws (default: 0)")
-    parser.add_argument("--quick", action="store_true", help="a run of a minute, to see that all works")
-    parser.add_argument("--workers", type=int, help="processes (default: one a core)")
-    parser.add_argument(
-        "--out", metavar="DIR", help="run folder (default: runs/faults/STAMP); resumes an unfinished run"
-    )
-    parser.add_argument("--force", action="store_true", help="start over, also where --out holds a finished run")
+    add_run_options(parser, "faults", "data, faults and draws", "a run of a minute", workers=True)
     return parser
 
 

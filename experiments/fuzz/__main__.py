@@ -21,12 +21,14 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
+from experiments.command_line import add_run_options, command, experiment_parser
 from experiments.fuzz.campaign import VERDICTS, Tally, run_kind
 from experiments.fuzz.kinds import KINDS
 from experiments.fuzz.worker import MEMORY
-from experiments.run_folder import RunFolder, write_json
+from experiments.run_folder import RunFolder
 
 
+@command
 def main(arguments: list[str] | None = None) -> None:
     """Run the campaign from the command line."""
     options = _parser().parse_args(arguments)
@@ -46,7 +48,7 @@ def main(arguments: list[str] | None = None) -> None:
         "quick": options.quick,
         "limit": options.limit,
     }
-    run = RunFolder("fuzz", settings, options.out, options.force)
+    run = RunFolder("fuzz", settings, options.out, options.force, arguments)
     tallies: dict[str, Tally] = {}
     with tempfile.TemporaryDirectory() as folder, tqdm(desc="cases", unit="case", dynamic_ncols=True) as bar:
         for name in names:
@@ -57,7 +59,7 @@ def main(arguments: list[str] | None = None) -> None:
             bad = sum(len(tally.failures) for tally in tallies.values())
             bar.set_postfix_str(f"failures {bad}")
     results = {**summarise(tallies), "seconds": round(time.monotonic() - began, 1)}
-    write_json(run.results, results)
+    run.finish(results)
     _print(results)
     print(f"{results['seconds']:.0f} s; written to {run.path}")
     if results["failures"]:
@@ -107,18 +109,13 @@ def _print(results: Mapping[str, Any]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m experiments.fuzz", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = experiment_parser("fuzz", __doc__)
     parser.add_argument(
         "--kinds", default=",".join(KINDS), metavar="A,B", help=f"kinds of files (default: {','.join(KINDS)})"
     )
     parser.add_argument("--rounds", type=int, default=100, help="of each sort of random damage (default: 100)")
     parser.add_argument("--limit", type=float, default=20.0, metavar="S", help="seconds a case (default: 20)")
-    parser.add_argument("--seed", type=int, default=0, help="of random damage (default: 0)")
-    parser.add_argument("--quick", action="store_true", help="a small campaign, to see that all works")
-    parser.add_argument("--out", metavar="DIR", help="run folder (default: runs/fuzz/STAMP)")
-    parser.add_argument("--force", action="store_true", help="start over, also where --out holds a finished run")
+    add_run_options(parser, "fuzz", "random damage", "a small campaign", resumes=False)
     return parser
 
 

@@ -1,0 +1,69 @@
+"""What the commands of all experiments have in common: where a run goes, and what it starts from."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from concurrent.futures.process import BrokenProcessPool
+from functools import wraps
+
+GOES_ON = "what is finished is kept, and the same --out goes on"
+
+
+def command(main: Callable[[list[str] | None], None]) -> Callable[[list[str] | None], None]:
+    """A main function that says in a line what ends it without being its fault: a disk, a process that died.
+
+    Raises:
+        SystemExit: then.
+    """
+
+    @wraps(main)
+    def run(arguments: list[str] | None = None) -> None:
+        """See the function itself."""
+        try:
+            main(arguments)
+        except BrokenProcessPool as error:
+            raise SystemExit(
+                f"one of the processes of this run died, perhaps for lack of memory; {GOES_ON}"
+            ) from error
+        except OSError as error:
+            raise SystemExit(f"{error}; {GOES_ON}") from error
+
+    return run
+
+
+def experiment_parser(name: str, description: str | None) -> argparse.ArgumentParser:
+    """The parser of ``python -m experiments.NAME``, without options of its own."""
+    return argparse.ArgumentParser(
+        prog=f"python -m experiments.{name}",
+        description=description,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def add_data_options(parser: argparse.ArgumentParser) -> None:
+    """``--data`` and ``--demonstrations``."""
+    parser.add_argument("--data", metavar="FILE.npz", help="recordings in the project's format (default: simulated)")
+    parser.add_argument("--demonstrations", type=int, default=221, metavar="N", help="simulated ones (default: 221)")
+
+
+def add_run_options(
+    parser: argparse.ArgumentParser, name: str, seed: str, quick: str, workers: bool = False, resumes: bool = True
+) -> None:
+    """``--seed``, ``--quick``, ``--workers``, ``--out`` and ``--force``.
+
+    Args:
+        parser: to add them to.
+        name: of the experiment.
+        seed: what is drawn from it.
+        quick: how long a quick run takes.
+        workers: whether it works in several processes.
+        resumes: whether an unfinished run goes on.
+    """
+    parser.add_argument("--seed", type=int, default=0, help=f"of {seed} (default: 0)")
+    parser.add_argument("--quick", action="store_true", help=f"{quick}, to see that all works")
+    if workers:
+        parser.add_argument("--workers", type=int, help="processes, without torchrun (default: one a core)")
+    goes_on = "; resumes an unfinished run" if resumes else ""
+    parser.add_argument("--out", metavar="DIR", help=f"run folder (default: runs/{name}/STAMP){goes_on}")
+    parser.add_argument("--force", action="store_true", help="start over, also where --out holds a finished run")
