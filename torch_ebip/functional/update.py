@@ -178,12 +178,13 @@ def _innovation(
         y = torch.where(observed, y, 0)
         mean = torch.where(observed, mean, 0)
     shares = member_shares(projections, weights)
-    variance = (anomalies.square() * shares).sum(-2) + noise.square().sum(-1)
+    # In units of its own standard deviation S has ones on its diagonal: modalities whose units differ by
+    # many orders of magnitude can be factored together in float32. The result is the same in all units, so they
+    # are constants to the gradient, whose way through them would cancel, or overflow where deviations are tiny.
+    variance = (anomalies.detach().square() * shares.detach()).sum(-2) + noise.detach().square().sum(-1)
     if observed is not None:
         variance = torch.where(observed, variance, 1)
     scale = torch.where(variance > 0, variance, 1).sqrt()
-    # In units of its own standard deviation S has ones on its diagonal: modalities whose units differ by
-    # many orders of magnitude can be factored together in float32.
     anomalies = anomalies / scale.unsqueeze(-2)
     noise = noise / scale.unsqueeze(-1)
     weighted = anomalies * shares
@@ -221,6 +222,8 @@ def _through_gain(
     if taper is None and inflation is None and 4 * n * D > 2 * n * E + 2 * E * D:
         return add_product(members, solved @ weighted, members)
     if inflation is not None:
+        if innovation.observed is not None:  # an entry that measured nothing is left as it is
+            inflation = torch.where(innovation.observed.any(-1), inflation, 1)
         growth = inflation[..., None, None].expand(*members.shape[:-2], 1, 1)
         shares = members.new_full((E,), 1 / E) if weights is None else weights
         shares = shares.unsqueeze(-2).expand(*members.shape[:-2], 1, E)
