@@ -104,8 +104,11 @@ class InteractionPrimitive(nn.Module):
             variance[dofs] = mean_squared_residual(fit, part).nanmean(0)
             correlation[dofs] = correlation_time(fit, part)
         spread = _measured_variance(samples)
-        # A DoF that is fitted exactly would have R = 0, and with it a singular innovation covariance.
-        variance = torch.maximum(variance, 1e-10 * spread).clamp(min=1e-12)
+        # A DoF that is fitted exactly would have R = 0, and with it a singular innovation covariance. What floor is
+        # small depends on its unit, which its spread tells, its size if it never moves, and nothing if it is 0.
+        size = torch.where(samples.observed, samples.values, 0).square().amax((0, 1))
+        variance = torch.maximum(variance, torch.where(spread > 0, 1e-10 * spread, 1e-12 * size))
+        variance = torch.where(variance > 0, variance, 1e-12)
         dtype = demonstrations[0].dtype
         velocity = 1 / demonstrations.durations.to(weights)
         tensors: Sequence[Tensor] = (weights, velocity, variance, correlation, spread)
