@@ -63,7 +63,16 @@ class Positive(Constrained):
     @property
     def value(self) -> Tensor:
         """Positive values [...], shape of `start`."""
-        return self.start * (self.floor + (1 - self.floor) * self.raw.exp())
+        return self.start * self._factor
+
+    @property
+    def root(self) -> Tensor:
+        """Square root [...] of the value; so that the gradient passes no square of a unit, which may be tiny."""
+        return self.start.sqrt() * self._factor.sqrt()
+
+    @property
+    def _factor(self) -> Tensor:
+        return self.floor + (1 - self.floor) * self.raw.exp()
 
 
 class AboveOne(Constrained):

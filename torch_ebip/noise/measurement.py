@@ -58,7 +58,7 @@ class MeasurementNoise(nn.Module):
         Raises:
             ValueError: R depends on phase and none is given.
         """
-        deviation = self.variance.value.sqrt()
+        deviation = self.variance.root
         if self.context is None:
             return deviation
         if phase is None:
