@@ -7,8 +7,9 @@ many orders of magnitude below what the basis misses.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
@@ -103,18 +104,30 @@ class Problem:
         self.generator = generator
 
 
+NAMED = r"cannot be factored|not finite|hold NaN"
+"""What errors say that say what is wrong with numbers."""
+
+
 def is_named(error: ValueError) -> bool:
-    """Whether an error says what is wrong with numbers."""
-    return any(text in str(error) for text in ("cannot be factored", "not finite"))
+    """Whether an error does."""
+    return re.search(NAMED, str(error)) is not None
 
 
+WILD = 1e3
+"""Interactions a second. With R at its floor, a thousandth of what the basis misses, few members can throw the phase
+away by more with each update, and gradients through all of them are products as large."""
 MICROMETRES = Case("mixture", torch.float32, (0, -6, 0), 2, None, 0.0, True, 1)
 """A small unit and R at its floor: squares of the deviation's inverse are more than float32 holds."""
+
+TWO = Case("bip", torch.float32, (0, 0, 0), 2, None, 0.0, False, 1)
+"""A prior covariance of rank one."""
 
 
 @settings(max_examples=60)
 @given(cases(tuple(MAKE)))
 @example(MICROMETRES)
+@example(TWO)
+@example(replace(TWO, floored=True, seed=0))
 def test_finite_or_a_named_error(case: Case) -> None:
     problem = Problem(case)
     made, unit = problem.filter, problem.unit
@@ -130,6 +143,12 @@ def test_finite_or_a_named_error(case: Case) -> None:
         return
     forecast = made.forecast(trace.state, torch.tensor([0.5, 1.0], dtype=case.dtype))
     values: list[Tensor] = [trace.phase, trace.log_likelihood, trace.projection, forecast.mean, forecast.variance]
+    if case.floored and not trace.state.mean[1].abs() < WILD:
+        # Thrown away so far that the last update may have overflowed: then the next one must say so.
+        if not trace.state.mean.isfinite().all():
+            with pytest.raises(ValueError, match=NAMED):
+                made.update(trace.state, torch.where(SEEN, made.project(trace.state), math.nan).nan_to_num())
+        return
     assert all(value.isfinite().all() for value in (*values, trace.state.mean))
     assert (forecast.variance >= 0).all()
     deviation = forecast.variance / unit.square()
@@ -140,6 +159,7 @@ def test_finite_or_a_named_error(case: Case) -> None:
 
 @settings(max_examples=40)
 @given(cases(("closed form", "all options")))
+@example(Case("closed form", torch.float32, (-9, 0, 0), 2, None, 0.3, True, 60))
 def test_the_live_filter(case: Case) -> None:
     problem = Problem(case)
     assert isinstance(problem.filter, EnsembleFilter)
@@ -156,7 +176,9 @@ def test_the_live_filter(case: Case) -> None:
         assert case.floored
         assert is_named(failure)
         return
-    assert live.finite
+    if not live.finite:  # it says so: members so large that their variance would not be
+        assert case.floored
+        return
     forecast = live.forecast(torch.tensor([0.5, 1.0], dtype=case.dtype))
     assert forecast.mean.isfinite().all()
     assert forecast.variance.isfinite().all()
@@ -175,5 +197,5 @@ def test_inflation_that_ran_away_is_named(kind: str) -> None:
             live.predict()
             live.update(y)
 
-    with pytest.raises(ValueError, match=r"cannot be factored|not finite"):
+    with pytest.raises(ValueError, match=NAMED):
         run()

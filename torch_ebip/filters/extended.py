@@ -117,7 +117,7 @@ class ExtendedFilter(Filter):
         try:
             factor = cholesky(S / (scale.unsqueeze(-1) * scale.unsqueeze(-2)), rows)
         except FactorisationError as error:
-            raise self._named(error, None) from error
+            raise self._named(error, None) from error  # its DoFs are numbered as in the filter
         residual = values - predicted
         gain = torch.cholesky_solve(cross.transpose(-1, -2) / scale.unsqueeze(-1), factor) / scale.unsqueeze(-1)
         gain = gain.transpose(-1, -2)
@@ -178,7 +178,8 @@ class ExtendedFilter(Filter):
         phase = self._phases_ahead(state) if phase is None else phase
         phase = phase.to(state.mean).expand(*state.mean.shape[:-1], phase.shape[-1])
         mean = basis.project(phase, state.mean[..., 2:].unsqueeze(-2))
-        variance = basis.project_covariance(phase, state.covariance[..., 2:, 2:])
+        # Where the prior is rank deficient rounding can leave less than nothing.
+        variance = basis.project_covariance(phase, state.covariance[..., 2:, 2:]).clamp(min=0)
         return Forecast(mean, variance, phase)
 
     def restrict(self, dofs: Tensor, thinning: int = 1) -> ExtendedFilter:

@@ -120,13 +120,14 @@ class Plan:
         diagonal = factor.diagonal(dim1=-2, dim2=-1)
         if self.values.ndim > 1:
             distance = (residual * shift).sum((-1, -2))
-            finite = bool(distance.isfinite().all())
             constant = self.constant if seen is None else self.constant * seen.to(residual).mean((-1, -2))
             likelihood = torch.sub(constant, torch.add(diagonal.log().sum(-1), distance, alpha=0.5))
+            finite = bool(likelihood.isfinite().all())
         else:  # a few numbers: faster in Python than in kernels
             deviance = float(torch.dot(residual.view(-1), shift.view(-1)))
             finite = math.isfinite(deviance)
             deviance = sum(map(math.log, diagonal.tolist())) + 0.5 * deviance if finite else math.nan
+            finite = math.isfinite(deviance)  # an S that overflowed has a factor, too
             likelihood = torch.sub(self.constant, self.one, alpha=deviance)
         if not finite:
             self.check_finite(seen)
