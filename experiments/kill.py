@@ -3,8 +3,8 @@
 A small recording is made and tuned on once without disturbance. Then the same command is started, killed after a
 random time, looked at and started again, until it is finished; then once more from the beginning, until there were
 as many kills as asked for. After each kill every file of the run must be whole: JSON that parses, a checkpoint that
-loads with weights only. Each finished run must have the numbers of the undisturbed one, to the bit, in its results and
-in its tuned filter, and nothing half-written beside them.
+loads with weights only. Each finished run must have the numbers of the undisturbed one, to the bit, in its results
+and in its tuned filter, and nothing half-written beside them.
 """
 
 from __future__ import annotations
