@@ -8,7 +8,6 @@ One thread.
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
@@ -24,9 +23,10 @@ from rich.table import Table
 from tqdm import tqdm
 
 from experiments import figures  # chooses a backend without a screen
+from experiments.command_line import add_run_options, command, experiment_parser
 from experiments.data import load
 from experiments.folds import split
-from experiments.run_folder import RunFolder, write_json
+from experiments.run_folder import RunFolder, read_json, save_figure, write_json
 from experiments.soak.stream import Sample, stream
 from experiments.soak.subjects import SHARES, SUBJECTS, Subject
 from experiments.soak.watch import Window, relative_time, verdict, watch
@@ -81,8 +81,9 @@ def figure(records: Sequence[Mapping[str, Any]]) -> Figure:
     return made
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the experiment from the command line; 1 if anything is wrong."""
+@command
+def main(arguments: list[str] | None = None) -> None:
+    """Run the experiment from the command line; exit status 1 if anything is wrong."""
     options = _parser().parse_args(arguments)
     torch.set_num_threads(1)
     steps = min(options.steps, 20_000) if options.quick else options.steps
@@ -95,7 +96,7 @@ def main(arguments: list[str] | None = None) -> int:
     names = SENSORS if options.data is None else [name for name in layout.names if name not in controlled]
     sensors = layout.mask(names)
     settings = {"data": options.data, "steps": steps, "seed": options.seed, "filters": options.filters}
-    run = RunFolder("soak", settings, options.out, options.force)
+    run = RunFolder("soak", settings, options.out, options.force, arguments)
     training, testing = split(len(demonstrations), 1, 0, options.seed)
     known, shown = demonstrations.subset(training[:MEMBERS]), demonstrations.subset(testing)
     basis = StackedBasis([BSplineBasis(8)] * layout.n_dofs)
@@ -103,7 +104,7 @@ def main(arguments: list[str] | None = None) -> int:
     records = []
     for name in options.filters:
         path = run.path / f"soak_{name}.json"
-        stored = json.loads(path.read_text()) if path.exists() else {"wrong": None}
+        stored = read_json(path) if path.exists() else {"wrong": None}
         if stored["wrong"] is None:  # not finished
             asked = max(10 * LEAST, round(SHARES.get(name, 1.0) * steps))
             make = partial(SUBJECTS[name], primitive, sensors, options.seed)
@@ -121,11 +122,12 @@ def main(arguments: list[str] | None = None) -> int:
         "wrong": wrong,
         "filters": records,
     }
-    figure(records).savefig(run.path / "soak.png", dpi=110)
-    write_json(run.results, results)
+    save_figure(figure(records), run.path / "soak.png")
+    run.finish(results)
     _print(results)
     print(f"written to {run.path}")
-    return 1 if wrong else 0
+    if wrong:
+        raise SystemExit(1)
 
 
 def _print(results: Mapping[str, Any]) -> None:
@@ -161,21 +163,14 @@ def _numbers(window: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m experiments.soak",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = experiment_parser("soak", __doc__)
     slow = ", ".join(f"{name} {share:g}" for name, share in SHARES.items())
     parser.add_argument("--data", metavar="FILE.npz", help="recordings in the project's format (default: simulated)")
     parser.add_argument("--steps", type=int, default=1_000_000, help=f"of each; of some a share: {slow}")
     parser.add_argument("--filters", nargs="+", choices=list(SUBJECTS), default=list(SUBJECTS), help="default: all")
-    parser.add_argument("--seed", type=int, default=0, help="of data, splits and draws (default: 0)")
-    parser.add_argument("--quick", action="store_true", help="a small run, to see that all works")
-    parser.add_argument("--out", metavar="DIR", help="run folder (default: runs/soak/STAMP)")
-    parser.add_argument("--force", action="store_true", help="start over, also where --out holds a finished run")
+    add_run_options(parser, "soak", "data, splits and draws", "a small run")
     return parser
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    main()

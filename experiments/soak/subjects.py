@@ -73,28 +73,22 @@ class _Watched:
 
 
 class Live:
-    """A live filter: one for all time, or a new one for each interaction."""
+    """A live filter, one for all time."""
 
-    def __init__(self, filter: EnsembleFilter, sensors: Tensor, seed: int, anew: bool) -> None:
-        self._filter, self._sensors, self._anew = filter, sensors, anew
-        self._generator = torch.Generator().manual_seed(seed)
+    def __init__(self, filter: EnsembleFilter, sensors: Tensor, seed: int) -> None:
         self._watched = _Watched(filter)
-        self._live: LiveFilter | None = None
+        self._live = LiveFilter(filter, sensors, generator=torch.Generator().manual_seed(seed))
 
     def begin(self) -> None:
         """See `Subject`."""
-        if self._live is None or self._anew:
-            self._live = LiveFilter(self._filter, self._sensors, generator=self._generator)
 
     def step(self, sample: Sample) -> None:
         """See `Subject`."""
-        assert self._live is not None
         self._live.predict(sample.dt)
         self._live.update(sample.y, sample.observed)
 
     def health(self) -> Health:
         """See `Subject`."""
-        assert self._live is not None
         return self._watched.look(self._live.state)
 
 
@@ -168,7 +162,7 @@ def _deviations(state: Any) -> Tensor:
 
 
 def _square_root(primitive: InteractionPrimitive) -> EnsembleFilter:
-    """What is tuned, but without inflation, which knows no end: see `SUBJECTS`."""
+    """What is tuned, but without inflation."""
     return ebip(
         primitive,
         residual_variance=START.factor * primitive.residual_variance,
@@ -180,15 +174,14 @@ def _square_root(primitive: InteractionPrimitive) -> EnsembleFilter:
 
 
 SUBJECTS: dict[str, Callable[[InteractionPrimitive, Tensor, int], Subject]] = {
-    "closed_form": lambda primitive, sensors, seed: Live(ebip(primitive), sensors, seed, False),
-    "square_root": lambda primitive, sensors, seed: Live(_square_root(primitive), sensors, seed, False),
-    "tuned": lambda primitive, sensors, seed: Live(tunable(primitive, START), sensors, seed, True),
+    "closed_form": lambda primitive, sensors, seed: Live(ebip(primitive), sensors, seed),
+    "square_root": lambda primitive, sensors, seed: Live(_square_root(primitive), sensors, seed),
+    "tuned": lambda primitive, sensors, seed: Live(tunable(primitive, START), sensors, seed),
     "sessions": lambda primitive, sensors, seed: Sessions(tunable(primitive, START), primitive, sensors),
     "particle": lambda primitive, sensors, seed: Steps(particle_filter(primitive, weight_noise=0.05), sensors, seed),
     "bip": lambda primitive, sensors, seed: Steps(bip(primitive), sensors, seed),
 }
-"""By name. `closed_form` (the paper's), `square_root` (weighted, R over phase), `particle` and `bip` are never begun
-again: for them all interactions are one. `tuned` (`square_root` with inflation) is, and so are `sessions`: inflation
-multiplies what no sensor reduces, and 1.002 to the power of 20 000 updates is more than float32 holds."""
+"""By name. `closed_form` is the paper's, `square_root` is weighted and has R over phase, `tuned` also inflates. None
+is ever begun again, for them all interactions are one, but for `sessions`, each of which is an interaction."""
 SHARES = {"particle": 0.2, "bip": 0.1, "sessions": 0.1}
 """Of the steps that are asked for, where they are slow and have no state or a small one that could drift."""

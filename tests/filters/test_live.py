@@ -269,3 +269,25 @@ def test_span_members_are_what_they_were_started_with() -> None:
         span = SpanMembers(start, seen)
         torch.testing.assert_close(span.members(torch.arange(10)), start)
         assert span.matrix.shape == (2, 2 + min(10, len(seen) + 3), 3)
+
+
+@pytest.mark.parametrize("live", [True, False])
+def test_a_filter_left_running_inflates_no_more_than_ten_times(live: bool) -> None:
+    """1.01 a sample is 1.01^3000 = 10^13; without an end to it the weights that nobody measures run away."""
+    made = ebip(small_primitive(), square_root=True, inflation=1.01)
+    y = torch.where(HUMAN, interactions(2, seed=7)[1], torch.nan)
+    at_work = LiveFilter(made, HUMAN, generator=torch.Generator().manual_seed(0))
+    state = made.initial_state(generator=torch.Generator().manual_seed(0))
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for t in range(600):
+            if live:
+                at_work.predict()
+                at_work.update(y[t % 40])
+            else:
+                state = made.update(made.predict(state, made.dt, generator), y[t % 40])[0]
+    state = at_work.state if live else state
+    assert float(state.growth) == pytest.approx(10.0)
+    hidden = slice(2 + 3 * 6, None)  # the arm's weights
+    spread = state.members[:, hidden].std(0) / made.initial_state().members[:, hidden].std(0)
+    assert spread.max() < 11

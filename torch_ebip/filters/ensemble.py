@@ -18,6 +18,10 @@ from torch_ebip.functional import Taper
 from torch_ebip.noise.pair import FilterNoise
 from torch_ebip.noise.process import InteractionNoise
 
+MOST_GROWTH = 10.0
+"""What all inflations of one interaction may come to. They enlarge what no sensor reduces, and an interaction lasts a
+hundred samples; a filter that is left running must not end in infinity."""
+
 
 class EnsembleFilter(MemberFilter):
     """Ensemble Kalman filter, stochastic (the paper's) or square-root.
@@ -33,7 +37,8 @@ class EnsembleFilter(MemberFilter):
         dt: seconds between samples where none is given.
         square_root: deterministic update instead of perturbed observations.
         inflation: factor on the anomalies after each update that measured something; a number, or a
-            module with a ``value`` such as `AboveOne` to learn it.
+            module with a ``value`` such as `AboveOne` to learn it. All of an interaction together come to at most
+            `MOST_GROWTH`.
         localisation: factors on the cross-covariances of blocks of the state.
         weighting: weigh members by the evidence for the demonstrations they came from; default: all alike.
             Needs a state of phase, phase velocity and weights.
@@ -82,14 +87,16 @@ class EnsembleFilter(MemberFilter):
     ) -> EnsembleState:
         """Step 1 of the paper's algorithm; see `Filter.initial_state`."""
         started = self.prior(batch_shape, self.n_members, members, generator)
-        return EnsembleState(started, None if self.weighting is None else self.weighting.start(started))
+        evidence = None if self.weighting is None else self.weighting.start(started)
+        growth = None if self.inflation is None else started.new_ones(started.shape[:-2])
+        return EnsembleState(started, evidence, growth)
 
     def _predict(self, state: EnsembleState, dt: Tensor, generator: Generators) -> EnsembleState:
         """Step 2: x = g(x) + N(0, Q)."""
         evidence = state.evidence
         if self.weighting is not None and evidence is not None:
             evidence = self.weighting.forget(evidence, dt)
-        return EnsembleState(self._advance(state.members, dt, generator), evidence)
+        return EnsembleState(self._advance(state.members, dt, generator), evidence, state.growth)
 
     def _update(
         self, state: EnsembleState, y: Tensor, observed: Tensor, generator: Generators
@@ -125,13 +132,15 @@ class EnsembleFilter(MemberFilter):
                 columns = rows if columns is None else columns[rows]
             evidence = self.weighting.learn(evidence, paths, y, observed, phase, columns, trust)
         factor = torch.diag_embed(deviation)
-        growth = None
+        inflation, growth = None, state.growth
         if self.inflation is not None:
-            growth = self._growth(members, observed.any(-1) if trust is None else trust.amax(-1))
+            growth = members.new_ones(members.shape[:-2]) if growth is None else growth
+            inflation = self._inflate(growth, observed.any(-1) if trust is None else trust.amax(-1))
+            growth = growth * inflation
         try:
             if self.square_root:
                 updated, likelihood = functional.square_root_update(
-                    members, projections, y, factor, observed, taper, weights, growth
+                    members, projections, y, factor, observed, taper, weights, inflation
                 )
             else:
                 if draws is None:
@@ -139,11 +148,11 @@ class EnsembleFilter(MemberFilter):
                 elif rows is not None:
                     draws = draws[..., rows]
                 updated, likelihood = functional.ensemble_update(
-                    members, projections, y, factor, draws, observed, taper, weights, growth
+                    members, projections, y, factor, draws, observed, taper, weights, inflation
                 )
         except functional.FactorisationError as error:
             raise self._named(error, rows) from error
-        return EnsembleState(updated, evidence), likelihood
+        return EnsembleState(updated, evidence, growth), likelihood
 
     def _measure(self, state: EnsembleState, rows: Tensor | None) -> tuple[Tensor | None, Tensor, Tensor | None]:
         """Mean phase [...], projections [..., E, k] of some DoFs, and those of the demonstrations behind them."""
@@ -157,10 +166,10 @@ class EnsembleFilter(MemberFilter):
         phases, projections, paths = self.observation.measure(members, dofs, origin, offsets)
         return functional.ensemble_mean(phases.unsqueeze(-1), state.weights).squeeze(-1), projections, paths
 
-    def _growth(self, members: Tensor, share: Tensor) -> Tensor:
-        """Inflation [...] after a sample that counts for a share [...] of one, in [0, 1]."""
-        whole: Tensor = self._inflation_factor(members) ** self.thinning
-        return 1 + (whole - 1) * share.to(members)
+    def _inflate(self, growth: Tensor, share: Tensor) -> Tensor:
+        """Inflation [...] after a sample that counts for a share [...] of one, in [0, 1], on top of earlier ones."""
+        whole: Tensor = self._inflation_factor(growth) ** self.thinning
+        return torch.minimum(1 + (whole - 1) * share.to(growth), (MOST_GROWTH / growth).clamp(min=1))
 
     def _inflation_factor(self, members: Tensor) -> Tensor:
         value = self.inflation.value if isinstance(self.inflation, nn.Module) else self.inflation

@@ -39,11 +39,13 @@ class LiveSnapshot(NamedTuple):
     Attributes:
         matrix: the members, [..., m, E], as `SpanMembers` has them.
         evidence: for demonstrations; never changed in place.
+        growth: [...], product of all inflations so far; None where there is none.
         generators: their states, uint8 [bytes] each.
     """
 
     matrix: Tensor
     evidence: Evidence | None
+    growth: Tensor | None
     generators: list[Tensor]
 
 
@@ -110,9 +112,9 @@ class LiveFilter:
         self._draws_by_entry = self._draws.transpose(-1, -2)
         E = start.shape[-2]
         self._equal = start.new_full((*batch_shape, E, 1), 1 / E)
-        self._growth = 1.0
+        self._growth: Tensor | None = None
         if filter.inflation is not None:
-            self._growth = float(filter._inflation_factor(start)) ** filter.thinning
+            self._growth = start.new_ones(batch_shape) if state.growth is None else state.growth
         self._robust = filter.noise.robust
         self._changing_noise = bool(getattr(filter.noise.measurement, "depends_on_phase", True))
         self._factor: tuple[float, Tensor] | None = None
@@ -158,7 +160,7 @@ class LiveFilter:
             into: an older snapshot of this filter, whose memory is used again.
         """
         matrix = self._members.clone() if into is None else into.matrix.copy_(self._members)
-        return LiveSnapshot(matrix, self._evidence, states_of(self.generator))
+        return LiveSnapshot(matrix, self._evidence, self._growth, states_of(self.generator))
 
     @torch.no_grad()
     def load(self, snapshot: LiveSnapshot) -> None:
@@ -167,7 +169,7 @@ class LiveFilter:
         Draws too, if the filter has a generator; torch's global one is not turned back.
         """
         self._members.copy_(snapshot.matrix)
-        self._evidence = snapshot.evidence
+        self._evidence, self._growth = snapshot.evidence, snapshot.growth
         set_states(self.generator, snapshot.generators)
 
     @torch.no_grad()
@@ -302,13 +304,12 @@ class LiveFilter:
     def _move(self, weighted: Tensor, moves: Tensor, share: float, even: Tensor, counts: Tensor | None) -> None:
         """X <- X + share (X weighted) moves in place, then inflated about its mean, the product with ``even``."""
         self._add_product(self._members, self._members @ weighted, moves, alpha=share)
-        if self._growth == 1:
+        if self._growth is None:
             return
-        mean = self._members @ even
-        if counts is None:
-            self._members.lerp_(mean, 1 - self._growth)
-        else:
-            self._members.lerp_(mean, (1 - self._growth) * counts.amax(-2, keepdim=True))
+        whole = torch.ones_like(self._growth) if counts is None else counts.amax((-2, -1))
+        inflation = self.filter._inflate(self._growth, whole)
+        self._growth = self._growth * inflation
+        self._members.lerp_(self._members @ even, (1 - inflation)[..., None, None])
 
     def _deviations(self) -> tuple[Tensor, bool]:
         """Standard deviations of all sensors' DoFs now, and whether they change with phase."""
@@ -352,9 +353,11 @@ class LiveFilter:
         return (self.filter if all(chosen) else self.filter.restrict(dofs)), self._columns(dofs)
 
     def _state(self, columns: Tensor, entry: int | None = None) -> EnsembleState:
-        evidence, origin = self._evidence, self._origin
+        evidence, origin, growth = self._evidence, self._origin, self._growth
+        if growth is not None and entry is not None:
+            growth = growth[entry]
         if evidence is not None and origin is not None:
             if entry is not None:
                 evidence, origin = Evidence(*(part[entry] for part in evidence)), origin[entry]
             evidence = evidence._replace(origin=origin[..., columns])
-        return EnsembleState(self._span.members(columns, entry), evidence)
+        return EnsembleState(self._span.members(columns, entry), evidence, growth)

@@ -25,10 +25,12 @@ class EnsembleState(NamedTuple):
     Attributes:
         members: [..., E, n].
         evidence: what weights of the members rest on; None where all count alike.
+        growth: [...], product of all inflations so far; None where there is none.
     """
 
     members: Tensor
     evidence: Evidence | None = None
+    growth: Tensor | None = None
 
     @property
     def weights(self) -> Tensor | None:
