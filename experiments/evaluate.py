@@ -67,6 +67,7 @@ class FilterMethod:
         seed: of the draws; each interaction has its own.
         numbers: of the interactions that will be asked about, for their draws; default: 0, 1, ...
         dtype: another one, for a study in which a percent does not matter.
+        thinning: how many samples each one that it is shown stands for; see `Filter.restrict`.
     """
 
     def __init__(
@@ -75,15 +76,17 @@ class FilterMethod:
         seed: int,
         numbers: Sequence[int] | None = None,
         dtype: torch.dtype = torch.float64,
+        thinning: int = 1,
     ) -> None:
-        self.filter, self.seed, self.numbers, self.dtype = filter, seed, numbers, dtype
+        self.filter, self.seed, self.numbers = filter, seed, numbers
+        self.dtype, self.thinning = dtype, thinning
         self._filter = copy.deepcopy(filter).to(dtype)
 
     @torch.no_grad()
     def __call__(self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor) -> Answer:
         """See `Method`. DoFs that are neither shown nor asked for are left out of the filter."""
         used = observed.any(0).any(0) | dofs
-        part = self._filter.restrict(used)
+        part = self._filter.restrict(used, self.thinning)
         device = next(part.buffers()).device
         numbers = range(len(y)) if self.numbers is None else self.numbers
         draws = [seeded(self.seed, number) for number in numbers]

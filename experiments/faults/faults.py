@@ -153,8 +153,8 @@ def catalogue(layout: Layout, sensors: Sequence[str], starts: Sequence[float]) -
     Args:
         layout: of the recordings.
         sensors: modalities that are shown.
-        starts: shares of the interaction at which sensors are lost, and but for the last come back a fifth later;
-            at the middle one they freeze.
+        starts: shares of the interaction at which sensors are lost; those lost at the middle one come back a fifth
+            later in another fault, and freeze then in a third.
     """
     middle = starts[len(starts) // 2]
     found = [Fault("clean", "clean", None, lambda trajectory, wear: trajectory)]
@@ -162,7 +162,7 @@ def catalogue(layout: Layout, sensors: Sequence[str], starts: Sequence[float]) -
     found += [Fault(f"{name} lost at {s:.0%}", "lost", name, lost(name, s)) for s in starts for name in sensors]
     found += [
         Fault(f"{name} lost, {s:.0%} to {s + 0.2:.0%}", "back", name, lost(name, s, s + 0.2))
-        for s in starts[:-1]
+        for s in starts[1:-1]
         for name in sensors
     ]
     found += [Fault(f"{name} frozen at {middle:.0%}", "frozen", name, frozen(name, middle)) for name in sensors]
@@ -173,7 +173,7 @@ def catalogue(layout: Layout, sensors: Sequence[str], starts: Sequence[float]) -
     ]
     found += [Fault(f"{name} drifts to 1 sd", "drift", name, drift(name, 1.0)) for name in sensors]
     found += [
-        Fault("NaN bursts of 10, 20%", "missing", None, dropouts(0.2, 10)),
+        Fault("NaN bursts of 5, 20%", "missing", None, dropouts(0.2, 5)),
         Fault("dropouts, 20%", "missing", None, dropouts(0.2)),
         Fault("late by 0 to 100 ms", "jitter", None, jitter(0.1)),
     ]

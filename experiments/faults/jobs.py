@@ -41,9 +41,13 @@ METHODS: dict[str, Callable[[Path, InteractionPrimitive, int], Filter]] = {
 }
 """How each filter is made from the tuned one's folder, the primitive and the number of members."""
 SLOW = ("bip",)
-"""Takes as long as all others together, and is asked about the first interaction of each portion only."""
-PORTION = 4
+"""Take as long as all others together."""
+ASKED = 2
+"""Interactions of a portion that they are asked about."""
+PORTION = 11
 """Interactions that a process takes at once."""
+THINNING = 2
+"""Every second sample is shown, 30 a second of the simulation, for a study of that many faults in its time."""
 OBSERVED = 0.82
 """Share of an interaction that is shown."""
 
@@ -86,7 +90,8 @@ class Study:
         self.plan = plan
         demonstrations, task = load(plan.data, plan.demonstrations, plan.seed)
         training, testing = split(len(demonstrations), 1, 0, plan.seed)
-        self.known, self.tests = demonstrations.subset(training), demonstrations.subset(testing[: plan.tests])
+        self.known = demonstrations.subset(training)
+        self.tests = _thinned(demonstrations.subset(testing[: plan.tests]))
         self.primitive = InteractionPrimitive.fit(self.known, select_basis(self.known))
         self.sensors = next(reversed(task.subsets.values()))
         self.whole = task
@@ -132,18 +137,24 @@ def run_portion(job: Job) -> Values:
     methods: dict[str, FilterMethod] = {}
     for name in plan.methods:
         filter = METHODS[name](folder, study.primitive, plan.members)
-        methods[name] = FilterMethod(filter, plan.seed, dtype=torch.float32)
+        methods[name] = FilterMethod(filter, plan.seed, dtype=torch.float32, thinning=THINNING)
     deviation = study.primitive.value_variance.sqrt()
     values: Values = {}
     for fault in study.faults:
         task = study.task._replace(subsets={fault.name: study.sensors})
         said = suffer(fault, tests, study.sensors, deviation, numbers, plan.seed)
         for name, method in methods.items():
-            asked = 1 if name in SLOW else len(numbers)
+            asked = min(ASKED, len(numbers)) if name in SLOW else len(numbers)
             for cell, array in _answers(task, method, tests, said, numbers[:asked]).items():
                 values.setdefault(cell, {})[name] = np.pad(array, (0, len(numbers) - asked), constant_values=np.nan)
     write_values(finished, values)
     return values
+
+
+def _thinned(whole: Demonstrations) -> Demonstrations:
+    """Every so many samples of each, the last one among them."""
+    kept = [trajectory[(len(trajectory) - 1) % THINNING :: THINNING] for trajectory in whole]
+    return Demonstrations(whole.layout, kept, whole.rate / THINNING)
 
 
 def _answers(
