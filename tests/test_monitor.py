@@ -38,7 +38,7 @@ def served(tmp_path: Path) -> Iterator[str]:
         monitor.hyperparameters({"seed": 3, "only": ("*",)}, {"final/mse": 0.5})
     port = free_port()
     command = [sys.executable, "-m", "tensorboard.main", "--logdir", str(tmp_path), "--port", str(port)]
-    server = subprocess.Popen([*command, "--host", "127.0.0.1", "--load_fast=false"], stderr=subprocess.PIPE)
+    server = subprocess.Popen([*command, "--load_fast=false"], stderr=subprocess.PIPE)
     try:
         yield f"http://127.0.0.1:{port}/data"
     finally:
@@ -46,6 +46,19 @@ def served(tmp_path: Path) -> Iterator[str]:
         server.wait(20)
         assert server.stderr is not None
         server.stderr.close()
+
+
+def listening(port: int) -> set[str]:
+    """Addresses at which somebody listens on a port of this machine, as Linux tells."""
+    found = set()
+    for family, table in ((socket.AF_INET, "tcp"), (socket.AF_INET6, "tcp6")):
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
+            _, local, _, state = line.split()[:4]
+            address, _, number = local.partition(":")
+            if state == "0A" and int(number, 16) == port:
+                words = [bytes.fromhex(address[i : i + 8])[::-1] for i in range(0, len(address), 8)]
+                found.add(socket.inet_ntop(family, b"".join(words)))
+    return found
 
 
 def get(url: str, ready=bool) -> object:
@@ -76,6 +89,7 @@ def test_tags_read_back_over_http(served: str) -> None:
         "final/mse",
     }
     assert expected <= names, expected - names
+    assert listening(int(served.rsplit(":", 1)[1].split("/")[0])) == {"127.0.0.1"}  # unless it is told otherwise
     run = next(run for run, found in tags.items() if "validation/loss" in found)
     points = get(f"{served}/plugin/scalars/scalars?tag=validation%2Floss&run={urllib.request.quote(run)}")
     assert [step for _, step, _ in points] == [0, 4, 8, 12]
@@ -119,3 +133,25 @@ def test_what_is_learned_beside_r_is_logged() -> None:
     for i, j, name in ((0, 1, "hand~gaze"), (0, 2, "hand~arm"), (1, 2, "gaze~arm")):
         assert values[f"localisation/{name}"] == pytest.approx(float(matrix[i, j]))
     assert not any(name.startswith("R_phase") for name in values)  # R does not depend on phase here
+
+
+def test_a_disk_that_fails_ends_the_record_and_not_the_tuning(tmp_path: Path) -> None:
+    class Full:
+        """A writer whose disk is full from the second point on."""
+
+        points = 0
+
+        def add_scalar(self, *_: object) -> None:
+            self.points += 1
+            if self.points > 1:
+                raise OSError(28, "No space left on device")
+
+    monitor = Monitor(tmp_path)
+    monitor.close()
+    monitor._writer = full = Full()
+    monitor.scalars({"a": 1.0}, 0)
+    with pytest.warns(UserWarning, match=r"what TensorBoard shows ends here: .*No space left"):
+        monitor.scalars({"a": 1.0}, 1)
+    monitor.scalars({"a": 1.0}, 2)
+    monitor.close()
+    assert full.points == 2
