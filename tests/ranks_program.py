@@ -9,6 +9,7 @@ import signal
 import sys
 from pathlib import Path
 
+from tests.listening import addresses
 from tests.test_tuning import filter_and_tuner
 from torch_ebip.ranks import RankLostError, Ranks
 from torch_ebip.tuning import TuningSettings
@@ -33,9 +34,11 @@ def main(folder: Path, killed_at: int | None) -> None:
         raise SystemExit("run it again to go on") from None
     words = ranks.from_first(lambda: "from the first")
     gathered = ranks.gather(ranks.rank)
+    listening = ranks.gather(sorted(addresses()))
     if ranks.first:
         parameters = {name: p.detach().flatten().tolist() for name, p in made.named_parameters()}
         outcome = {"validation": result.validation, "parameters": parameters, "words": words, "ranks": gathered}
+        outcome["listening"] = listening
         (folder / "outcome.json").write_text(json.dumps(outcome))
     ranks.stop()
 

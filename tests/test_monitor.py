@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from tests.conftest import small_primitive
+from tests.listening import addresses
 from tests.test_tuning import filter_and_tuner
 from torch_ebip import ebip
 from torch_ebip.monitor import Monitor, noise_scalars
@@ -48,19 +49,6 @@ def served(tmp_path: Path) -> Iterator[str]:
         server.stderr.close()
 
 
-def listening(port: int) -> set[str]:
-    """Addresses at which somebody listens on a port of this machine, as Linux tells."""
-    found = set()
-    for family, table in ((socket.AF_INET, "tcp"), (socket.AF_INET6, "tcp6")):
-        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
-            _, local, _, state = line.split()[:4]
-            address, _, number = local.partition(":")
-            if state == "0A" and int(number, 16) == port:
-                words = [bytes.fromhex(address[i : i + 8])[::-1] for i in range(0, len(address), 8)]
-                found.add(socket.inet_ntop(family, b"".join(words)))
-    return found
-
-
 def get(url: str, ready=bool) -> object:
     """JSON behind a URL, once the server is up and has read the events."""
     deadline = time.monotonic() + 90
@@ -89,7 +77,7 @@ def test_tags_read_back_over_http(served: str) -> None:
         "final/mse",
     }
     assert expected <= names, expected - names
-    assert listening(int(served.rsplit(":", 1)[1].split("/")[0])) == {"127.0.0.1"}  # unless it is told otherwise
+    assert addresses(port=int(served.rsplit(":", 1)[1].split("/")[0])) == {"127.0.0.1"}  # unless it is told otherwise
     run = next(run for run, found in tags.items() if "validation/loss" in found)
     points = get(f"{served}/plugin/scalars/scalars?tag=validation%2Floss&run={urllib.request.quote(run)}")
     assert [step for _, step, _ in points] == [0, 4, 8, 12]

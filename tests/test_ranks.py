@@ -53,6 +53,8 @@ def test_the_result_does_not_depend_on_the_number_of_processes(tmp_path: Path) -
         assert_same(outcome(tmp_path / "1"), outcome(tmp_path / str(count)))
         assert outcome(tmp_path / str(count))["words"] == "from the first"
         assert outcome(tmp_path / str(count))["ranks"] == list(range(count))
+        # Processes of one machine listen for each other on it only.
+        assert outcome(tmp_path / str(count))["listening"] == [["127.0.0.1"]] * count
 
 
 def test_a_killed_process_ends_the_run_which_resumes_with_another_number(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from datetime import timedelta
@@ -52,6 +53,10 @@ class Ranks:
         torch.set_num_threads(max(1, (os.cpu_count() or 1) // locals_))
         if gpus:
             torch.cuda.set_device(device)
+        loopback = {"linux": "lo", "darwin": "lo0"}.get(sys.platform)
+        if loopback is not None and os.environ["WORLD_SIZE"] == str(locals_):
+            # Processes of one machine listen for each other there and nowhere else, unless gloo is told otherwise.
+            os.environ.setdefault("GLOO_SOCKET_IFNAME", loopback)
         # A process may wait for another's folds for long; that one has died is noticed by its closed connection.
         dist.init_process_group("cpu:gloo,cuda:nccl" if gpus >= locals_ else "gloo", timeout=timedelta(days=7))
         return cls(dist.get_rank(), dist.get_world_size(), device)

@@ -1,4 +1,4 @@
-"""Nothing is lost when a run is killed, the campaign would see it if it were, and workers do not outlive their run."""
+"""Nothing is lost when a run is killed, the campaign would see it if it were; workers do not outlive their run."""
 
 import json
 import os
