@@ -7,7 +7,7 @@ from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
 from functools import wraps
 
-GOES_ON = "what is finished is kept, and the same --out goes on"
+GOES_ON = "what is finished is kept: a run that resumes goes on with the same --out"
 
 
 def command(main: Callable[[list[str] | None], None]) -> Callable[[list[str] | None], None]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import threading
@@ -13,6 +14,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from experiments.results import Cell, Values
@@ -131,9 +133,14 @@ def mean_of_cells(values: Values, method: str, metric: str) -> float:
 
 
 def write_values(path: Path, values: Values) -> None:
-    """Values of a finished fold as JSON, atomically."""
+    """Values of a finished fold as JSON, atomically; what is infinite is a word there, NaN is null."""
+
+    def plain(array: NDArray[np.float64]) -> list[float | str]:
+        """Numbers, and words for what JSON has no numbers for."""
+        return [str(value) if math.isinf(value) else value for value in array.tolist()]
+
     content: list[Mapping[str, Any]] = [
-        {**cell._asdict(), "values": {name: array.tolist() for name, array in methods.items()}}
+        {**cell._asdict(), "values": {name: plain(array) for name, array in methods.items()}}
         for cell, methods in values.items()
     ]
     write_json(path, content)
@@ -150,10 +157,16 @@ def read_values(path: Path) -> Values:
     values: Values = {}
     try:
         for entry in content:
-            arrays = {name: np.array(v, dtype=np.float64) for name, v in entry.pop("values").items()}
+            arrays = {name: _numbers(listed) for name, listed in entry.pop("values").items()}
             if len({array.shape for array in arrays.values()}) != 1 or any(a.ndim != 1 for a in arrays.values()):
                 raise ValueError("expected as many numbers for every method")
             values[Cell(**entry)] = arrays
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{path}: not the values of a fold: {error}") from error
     return values
+
+
+def _numbers(listed: Sequence[float | str | None]) -> NDArray[np.float64]:
+    """What `write_values` made of an array."""
+    words = {"inf": math.inf, "-inf": -math.inf, None: math.nan}
+    return np.array([words.get(value, value) for value in listed], dtype=np.float64)

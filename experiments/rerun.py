@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.command_line import command, experiment_parser
-from experiments.run_folder import circumstances, read_json
+from experiments.run_folder import read_json
 
 MEASURED = re.compile(r"seconds|_per_second|_over_|megabytes|gigabytes|exponent|time_relative|^run$")
 """Names of what a clock or the machine says, and of the run itself."""
@@ -113,21 +113,23 @@ def main(arguments: list[str] | None = None) -> None:
     out = out.absolute()
     if out.exists():
         raise SystemExit(f"{out} exists; choose another --out")
-    now = circumstances([])
-    for key in ("commit", "changed_since_commit", "versions", "machine"):
-        if run.get(key) != now[key]:
-            print(f"{key} then: {run.get(key)}, now: {now[key]}")
     if run.get("processes", 1) > 1 or run.get("resumed_with"):
         print(
             "it ran in several processes, or was resumed with other versions; now it is one process and one version"
         )
     print("+", " ".join(line[1:]), f"--out {out}")
     place = home if Path(home).is_dir() else None
+    if place is None:
+        print(f"its working folder {home} is not there any more; it runs in this one")
     environment = {**os.environ, "OMP_NUM_THREADS": str(int(threads))}
     done = subprocess.run([*line, "--out", str(out)], cwd=place, env=environment, check=False)
     if done.returncode != 0:
         raise SystemExit(f"the run ended with {done.returncode}")
-    comparison = compare(before, read_json(out / "results.json"))
+    after = read_json(out / "results.json")
+    for key in ("commit", "changed_since_commit", "versions", "machine", "threads"):
+        if run.get(key) != after["run"][key]:
+            print(f"{key} then: {run.get(key)}, now: {after['run'][key]}")
+    comparison = compare(before, after)
     _print(comparison, options.tolerance)
     if comparison.largest > options.tolerance:
         raise SystemExit(1)

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import platform
+import secrets
 import shutil
 import subprocess
 import sys
@@ -53,7 +54,7 @@ class RunFolder:
         self.path = Path(out) if out is not None else Path("runs") / experiment / stamp
         config = self.path / "config.json"
         asked = json.loads(json.dumps(dict(settings)))
-        now = {"experiment": experiment, "settings": asked, **circumstances(arguments)}
+        now = {"experiment": experiment, "settings": asked, **_circumstances(arguments)}
         if self.path.exists() and not self.path.is_dir():
             raise SystemExit(f"{self.path} is a file, expected a folder to write the run to")
         try:
@@ -63,7 +64,10 @@ class RunFolder:
                     self._check(stored["settings"], asked)
                     self._resume(stored, now)
                     return
-                shutil.rmtree(self.path)
+                # At once out of the way: half a folder would be neither a run nor empty.
+                removed = self.path.with_name(f".{self.path.name}.{secrets.token_hex(4)}.removed")
+                os.replace(self.path, removed)
+                shutil.rmtree(removed)
             self._run = now
             write_json(config, now)
         except OSError as error:
@@ -153,7 +157,7 @@ def _unfinished(file: Path) -> bool:
     return file.name.startswith(".") and file.suffix == ".part"
 
 
-def circumstances(arguments: Sequence[str] | None) -> dict[str, Any]:
+def _circumstances(arguments: Sequence[str] | None) -> dict[str, Any]:
     """What else a result may depend on."""
     packages = ("torch", "numpy", "pytorch-kinematics", "tensorboard", "scipy", "matplotlib")
     commit = subprocess.run(

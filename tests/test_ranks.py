@@ -53,7 +53,7 @@ def test_the_result_does_not_depend_on_the_number_of_processes(tmp_path: Path) -
         assert_same(outcome(tmp_path / "1"), outcome(tmp_path / str(count)))
         assert outcome(tmp_path / str(count))["words"] == "from the first"
         assert outcome(tmp_path / str(count))["ranks"] == list(range(count))
-        # Processes of one machine listen for each other on it only.
+        # Processes of one machine listen for each other on it only; torchrun itself does not keep to that.
         assert outcome(tmp_path / str(count))["listening"] == [["127.0.0.1"]] * count
 
 

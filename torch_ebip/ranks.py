@@ -55,7 +55,8 @@ class Ranks:
             torch.cuda.set_device(device)
         loopback = {"linux": "lo", "darwin": "lo0"}.get(sys.platform)
         if loopback is not None and os.environ["WORLD_SIZE"] == str(locals_):
-            # Processes of one machine listen for each other there and nowhere else, unless gloo is told otherwise.
+            # Processes of one machine listen for each other there, unless gloo is told otherwise. The store that
+            # torchrun itself keeps listens on all addresses.
             os.environ.setdefault("GLOO_SOCKET_IFNAME", loopback)
         # A process may wait for another's folds for long; that one has died is noticed by its closed connection.
         dist.init_process_group("cpu:gloo,cuda:nccl" if gpus >= locals_ else "gloo", timeout=timedelta(days=7))

@@ -42,7 +42,8 @@ def main(arguments: list[str] | None = None) -> None:
         count, tests, steps, scan, starts = min(count, 60), min(tests, 2), min(steps, 5), 8, STARTS[1:2]
     if tests < 1 or options.members < 2:
         raise SystemExit("needs --tests of at least 1 and --members of at least 2")
-    groups = None if options.faults is None else tuple(dict.fromkeys(["clean", *options.faults]))
+    needed = ["clean", *(["without"] if "lost" in (options.faults or ()) else [])]  # what costs are measured by
+    groups = None if options.faults is None else tuple(dict.fromkeys([*needed, *options.faults]))
     plan = Plan("", options.data, count, tests, tuple(options.methods), groups, starts, options.members, options.seed)
     study = Study(plan)
     run = RunFolder("faults", {**plan.settings(), "steps": steps}, options.out, options.force, arguments)

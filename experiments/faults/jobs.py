@@ -80,7 +80,8 @@ class Plan:
 
     def settings(self) -> dict[str, Any]:
         """For the run's configuration."""
-        return {key: value for key, value in asdict(self).items() if key != "folder"}
+        fixed = {"thinning": THINNING, "observed": OBSERVED, "portion": PORTION, "asked_of_slow": ASKED}
+        return {**{key: value for key, value in asdict(self).items() if key != "folder"}, **fixed}
 
 
 class Study:
@@ -170,7 +171,13 @@ def _answers(
 
     every = range(len(numbers))
     try:
-        return ask(every, said)
+        answers = ask(every, said)
+        if not any(np.isnan(array).any() for array in answers.values()):
+            return answers
+        whole = ask(every, tests)  # NaN where nothing is known of the end; elsewhere the filter gave up silently
+        return {
+            cell: np.where(np.isnan(array) & ~np.isnan(whole[cell]), np.inf, array) for cell, array in answers.items()
+        }
     except ValueError:  # of one of them at least
         # What is asked of it, from what it says of the recordings as they were.
         values = {cell: np.full(len(every), np.inf) for cell in ask(every, tests)}

@@ -37,18 +37,20 @@ def faults_figure(results: Mapping[str, Any], method: str) -> Figure:
             kinds.setdefault(label, {})[fault["sensor"]] = fault["name"]
     figure = Figure(figsize=(11, 5), layout="constrained")
     axis = figure.subplots()
-    width = 0.85 / max(1, len(kinds))
-    colours = matplotlib.colormaps["viridis"](np.linspace(0.05, 0.95, max(1, len(kinds))))
+    width = 0.8 / max(1, len(kinds))
+    colours = matplotlib.colormaps["turbo"](np.linspace(0.05, 0.95, max(1, len(kinds))))
     for i, (label, names) in enumerate(kinds.items()):
         places = [k + (i - (len(kinds) - 1) / 2) * width for k, sensor in enumerate(sensors) if sensor in names]
         rows = [error[names[sensor]] for sensor in sensors if sensor in names]
         spread = [row["standard_error"] or 0.0 for row in rows]
-        axis.bar(places, [row["mean"] for row in rows], width, yerr=spread, label=label, color=colours[i],
-                 error_kw={"elinewidth": 0.6})  # fmt: skip
+        axis.errorbar(
+            places, [row["mean"] for row in rows], spread, fmt="o", ms=5, elinewidth=1, label=label, color=colours[i]
+        )
     axis.axhline(error["clean"]["mean"], color="black", linewidth=1, label="clean")
+    axis.set_yscale("log")
+    axis.grid(axis="y", which="both", alpha=0.2)
     axis.set_xticks(range(len(sensors)), sensors, rotation=20, ha="right")
     axis.set_ylabel(f"{method}: mean squared error\nof {target} at the end [{error['clean']['unit']}]")
-    axis.set_ylim(bottom=0)
     axis.legend(fontsize=8, ncols=2)
     axis.spines[["top", "right"]].set_visible(False)
     return figure

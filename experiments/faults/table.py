@@ -23,7 +23,7 @@ def summarise(values: Values, faults: Sequence[Fault], target: str, seed: int) -
 
     The cost of a fault is its mean squared error over that of what it is compared with, less 1: a lost sensor with
     the same sensors without it from the start, all else with the clean recording. The interval is that of a paired
-    bootstrap, 95 %, percentiles.
+    bootstrap, 95 %, percentiles. A filter that gives up on an interaction has no cost, but the number of them.
 
     Args:
         values: of all faults; the subset of a cell is the name of the fault; infinite where a filter gave up.
@@ -45,10 +45,13 @@ def summarise(values: Values, faults: Sequence[Fault], target: str, seed: int) -
                 continue
             asked = ~np.isnan(array)
             pairs = np.stack([array[asked], base[asked]])
-            if pairs.size and np.isfinite(pairs).all():
+            failed = int((~np.isfinite(pairs[0])).sum())
+            key = {"fault": fault.name, "group": fault.group, "method": method, "against": reference}
+            if failed:
+                costs.append({**key, "cost": None, "low": None, "high": None, "gave_up": failed})
+            elif pairs.size and np.isfinite(pairs).all():
                 cost, low, high = _cost(pairs[0], pairs[1], seed)
-                key = {"fault": fault.name, "group": fault.group, "method": method, "against": reference}
-                costs.append({**key, "cost": cost, "low": low, "high": high})
+                costs.append({**key, "cost": cost, "low": low, "high": high, "gave_up": 0})
     listed = [{"name": fault.name, "group": fault.group, "sensor": fault.sensor} for fault in faults]
     return {"rows": rows, "comparisons": [], "costs": costs, "faults": listed, "target": target}
 
@@ -88,9 +91,9 @@ def _cost(array: Array, base: Array, seed: int) -> tuple[float, float, float]:
 
 
 def worst(results: Mapping[str, Any], group: str, method: str) -> dict[str, Any] | None:
-    """The most expensive fault of a group for a method; None if there is none."""
+    """The most expensive fault of a group for a method, one that it gives up on before others; None without any."""
     found = [cost for cost in results["costs"] if (cost["group"], cost["method"]) == (group, method)]
-    return max(found, key=lambda cost: float(cost["cost"]), default=None)
+    return max(found, key=lambda cost: (cost["gave_up"], cost["cost"] or 0.0), default=None)
 
 
 def lines(results: Mapping[str, Any], coverage: bool = True) -> tuple[list[str], list[list[str]]]:
@@ -116,7 +119,13 @@ def lines(results: Mapping[str, Any], coverage: bool = True) -> tuple[list[str],
                 text += f", {inside['mean']:.0%}"
             line.append(text)
         body.append(line)
-    return ["fault", *methods], body
+    asked = {
+        name: max((row["n"] + row["gave_up"] for row in results["rows"] if row["method"] == name), default=0)
+        for name in methods
+    }
+    most = max(asked.values(), default=0)
+    heads = [name if asked[name] == most else f"{name} (n = {asked[name]})" for name in methods]
+    return ["fault", *heads], body
 
 
 def _number(value: float) -> str:
@@ -152,7 +161,9 @@ def verdicts(results: Mapping[str, Any]) -> list[str]:
         parts = []
         for method in dict.fromkeys(cost["method"] for cost in results["costs"]):
             cost = worst(results, group, method)
-            if cost is not None:
+            if cost is not None and cost["gave_up"]:
+                parts.append(f"{method} gives up on {cost['gave_up']} interactions ({cost['fault']})")
+            elif cost is not None:
                 interval = f"{_share(cost['low'])} to {_share(cost['high'])}"
                 parts.append(f"{method} {_share(cost['cost'])} ({interval}; {cost['fault']})")
         if parts:

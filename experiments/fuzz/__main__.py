@@ -102,6 +102,7 @@ def _print(results: Mapping[str, Any]) -> None:
         counts = [str(row[name]) for name in ("cases", *VERDICTS)]
         table.add_row(row["kind"], *counts, f"{row['slowest_seconds']:.2f}", f"{row['peak_megabytes']:.0f}")
     console = Console()
+    console.width = max(console.width, 120)
     console.print(table)
     for failure in results["failures"]:
         where = f"{failure['kind']}, {failure['mutation']}, seed {failure['seed']}"

@@ -143,7 +143,9 @@ def test_costs_are_paired_ratios_of_means() -> None:
     assert costs["left lost at 20%"]["cost"] == pytest.approx(0.1)
     assert costs["left lost at 20%"]["against"] == "without left"
     assert costs["left lost at 20%"]["low"] == pytest.approx(0.1)  # pairs do not vary
-    assert "spikes" not in costs
+    assert costs["spikes"]["gave_up"] == 40
+    assert costs["spikes"]["cost"] is None
+    assert "it gives up on 40 interactions (spikes)" in "\n".join(verdicts(results))
     assert next(row for row in results["rows"] if row["subset"] == "spikes")["gave_up"] == 40
     assert "+10 %" in "\n".join(verdicts(results))
 

@@ -1,9 +1,11 @@
 """Folds and interactions shared among processes come back in their order."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from experiments.folds import interleave, merge, run_folds
+from experiments.folds import interleave, merge, read_values, run_folds, write_values
 from experiments.results import Cell
 from torch_ebip.ranks import Ranks
 
@@ -46,3 +48,13 @@ def test_folds_shared_by_rank_come_back_in_order(rank: int) -> None:
     whole = run_folds(run, range(5), 1, lambda values: "", Together(rank, 2))
     assert ran == list(range(rank, 5, 2))
     assert whole[CELL]["a"].tolist() == merge([fold(i) for i in range(5)])[CELL]["a"].tolist()
+
+
+def test_values_come_back_from_their_file_as_they_were(tmp_path: Path) -> None:
+    """Infinite is where a method gave up, NaN where it was not asked."""
+    written = {CELL: {"a": np.array([0.1, np.nan, np.inf]), "b": np.array([-np.inf, 1e-300, 3.0])}}
+    write_values(tmp_path / "values.json", written)
+    read = read_values(tmp_path / "values.json")
+    assert list(read) == [CELL]
+    for name, array in written[CELL].items():
+        np.testing.assert_array_equal(read[CELL][name], array)

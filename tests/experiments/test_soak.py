@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import mmap
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -97,7 +98,7 @@ class Stand:
 
     def __init__(self, leak: int = 0, slow: int = 0, bad: int | None = None, error: int | None = None) -> None:
         self.leak, self.slow, self.bad, self.error = leak, slow, bad, error
-        self.kept: list[bytearray] = []
+        self.kept: list[mmap.mmap] = []
         self.steps = 0
 
     def begin(self) -> None:
@@ -105,7 +106,9 @@ class Stand:
 
     def step(self, sample: Sample) -> None:
         self.steps += 1
-        self.kept.append(bytearray(b"x" * self.leak))
+        if self.leak:  # pages of its own: free ones of the heap would hide the leak
+            self.kept.append(mmap.mmap(-1, self.leak))
+            self.kept[-1].write(b"x" * self.leak)
         for _ in range(2000 + self.slow * self.steps):
             pass
         if self.steps == self.error:

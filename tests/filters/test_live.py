@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tests.conftest import interactions, small_primitive
 from torch_ebip import BSplineBasis, EnsembleFilter, GaussianBasis, InteractionPrimitive, StackedBasis, ebip
-from torch_ebip.filters import ConstantVelocityPhase, LiveFilter
+from torch_ebip.filters import ConstantVelocityPhase, EnsembleState, LiveFilter
 from torch_ebip.filters.plan import PLANS, kept
 from torch_ebip.filters.span import SpanMembers
 from torch_ebip.noise import Huber, StudentT
@@ -291,3 +291,25 @@ def test_a_filter_left_running_inflates_no_more_than_ten_times(live: bool) -> No
     hidden = slice(2 + 3 * 6, None)  # the arm's weights
     spread = state.members[:, hidden].std(0) / made.initial_state().members[:, hidden].std(0)
     assert spread.max() < 11
+
+
+def test_what_has_grown_is_saved_and_loaded() -> None:
+    live = LiveFilter(ebip(small_primitive(), inflation=1.05), generator=torch.Generator().manual_seed(0))
+    y = interactions(2, seed=7)[1]
+    live.update(y[0])
+    snapshot, grown = live.save(), live.state.growth.clone()
+    live.update(y[1])
+    assert live.state.growth > grown > 1
+    live.load(snapshot)
+    assert torch.equal(live.state.growth, grown)
+
+
+def test_a_state_that_somebody_made_has_not_grown() -> None:
+    """Kept before anything was measured, and after."""
+    made = ebip(small_primitive(), inflation=1.05)
+    y = torch.nan_to_num(torch.stack([interactions(2, seed=7)[1][:8]] * 2))
+    observed = torch.ones(2, 8, 5, dtype=torch.bool)
+    observed[:, 0] = False
+    state = EnsembleState(made.initial_state((2,)).members)
+    kept = made(y, observed, state=state, keep=torch.tensor([[5], [0]])).kept
+    torch.testing.assert_close(kept.growth.detach(), torch.tensor([[1.05**5], [1.0]]))

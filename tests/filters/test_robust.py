@@ -154,3 +154,17 @@ def test_infinity_is_still_refused() -> None:
 def test_a_scale_must_be_positive() -> None:
     with pytest.raises(ValueError, match="above 0"):
         StudentT(0.0)
+
+
+@pytest.mark.parametrize("robust", KINDS.values(), ids=KINDS)
+def test_one_wild_sample_alone_does_not_choose_the_demonstration(robust: RobustWeights) -> None:
+    """Nothing else is known yet: the weights stay about even, where without robust updates one demonstration wins."""
+    sizes = {}
+    for kind in (None, robust):
+        made = ebip(small_primitive(torch.float64), weigh=True, robust=kind)
+        y = torch.full((5,), math.nan, dtype=torch.float64)
+        y[0] = 1000 * small_primitive(torch.float64).value_variance[0].sqrt()
+        weights = made.update(made.initial_state(), y, generator=torch.Generator().manual_seed(0))[0].weights
+        sizes[kind] = float(1 / weights.detach().square().sum())
+    assert sizes[None] < 3
+    assert sizes[robust] > 20  # of 24

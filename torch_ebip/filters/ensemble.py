@@ -88,20 +88,20 @@ class EnsembleFilter(MemberFilter):
         """Step 1 of the paper's algorithm; see `Filter.initial_state`."""
         started = self.prior(batch_shape, self.n_members, members, generator)
         evidence = None if self.weighting is None else self.weighting.start(started)
-        growth = None if self.inflation is None else started.new_ones(started.shape[:-2])
-        return EnsembleState(started, evidence, growth)
+        return EnsembleState(started, evidence, self._grown(EnsembleState(started)))
 
     def _predict(self, state: EnsembleState, dt: Tensor, generator: Generators) -> EnsembleState:
         """Step 2: x = g(x) + N(0, Q)."""
         evidence = state.evidence
         if self.weighting is not None and evidence is not None:
             evidence = self.weighting.forget(evidence, dt)
-        return EnsembleState(self._advance(state.members, dt, generator), evidence, state.growth)
+        return EnsembleState(self._advance(state.members, dt, generator), evidence, self._grown(state))
 
     def _update(
         self, state: EnsembleState, y: Tensor, observed: Tensor, generator: Generators
     ) -> tuple[EnsembleState, Tensor]:
         """Step 3: x = x + K (y + eps - h(x)), over the DoFs that some entry of the batch measured."""
+        state = state._replace(growth=self._grown(state))
         measured = observed.reshape(-1, self.n_dofs).any(0)
         draws = None
         if is_several(generator) and not self.square_root:
@@ -133,8 +133,7 @@ class EnsembleFilter(MemberFilter):
             evidence = self.weighting.learn(evidence, paths, y, observed, phase, columns, trust)
         factor = torch.diag_embed(deviation)
         inflation, growth = None, state.growth
-        if self.inflation is not None:
-            growth = members.new_ones(members.shape[:-2]) if growth is None else growth
+        if growth is not None:
             inflation = self._inflate(growth, observed.any(-1) if trust is None else trust.amax(-1))
             growth = growth * inflation
         try:
@@ -165,6 +164,12 @@ class EnsembleFilter(MemberFilter):
         dofs = None if rows is None else rows.tolist()
         phases, projections, paths = self.observation.measure(members, dofs, origin, offsets)
         return functional.ensemble_mean(phases.unsqueeze(-1), state.weights).squeeze(-1), projections, paths
+
+    def _grown(self, state: EnsembleState) -> Tensor | None:
+        """All inflations so far, [...]; a state that somebody made himself has had none."""
+        if self.inflation is None or state.growth is not None:
+            return None if self.inflation is None else state.growth
+        return state.members.new_ones(state.members.shape[:-2])
 
     def _inflate(self, growth: Tensor, share: Tensor) -> Tensor:
         """Inflation [...] after a sample that counts for a share [...] of one, in [0, 1], on top of earlier ones."""

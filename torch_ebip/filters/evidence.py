@@ -134,7 +134,8 @@ class EvidenceWeighting(nn.Module):
         any_observed = observed.any(-1)
         misfit = evidence.misfit - likelihood / temper.unsqueeze(-1)
         seen = evidence.seen + (share.sum(-1) / count.squeeze(-1))
-        mean = misfit / torch.where(seen > 0, seen, 1).unsqueeze(-1)
+        # Less than one sample, where values are not trusted, counts as little as it is: it is not scaled up to one.
+        mean = misfit / torch.where(seen > 1, seen, 1).unsqueeze(-1)
         weights = torch.softmax(-mean * temper.unsqueeze(-1), dim=-1)
         weights = (1 - self.defensive) * weights + self.defensive / weights.shape[-1]
         weights = torch.where(any_observed.unsqueeze(-1), weights, evidence.weights)

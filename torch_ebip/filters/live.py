@@ -112,9 +112,7 @@ class LiveFilter:
         self._draws_by_entry = self._draws.transpose(-1, -2)
         E = start.shape[-2]
         self._equal = start.new_full((*batch_shape, E, 1), 1 / E)
-        self._growth: Tensor | None = None
-        if filter.inflation is not None:
-            self._growth = start.new_ones(batch_shape) if state.growth is None else state.growth
+        self._growth = filter._grown(state)
         self._robust = filter.noise.robust
         self._changing_noise = bool(getattr(filter.noise.measurement, "depends_on_phase", True))
         self._factor: tuple[float, Tensor] | None = None

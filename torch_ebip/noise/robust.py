@@ -104,7 +104,7 @@ class StudentT(RobustWeights):
 class Huber(RobustWeights):
     """Huber's weights: w = c / |z|, never above 1 (Huber 1964).
 
-    What is far off moves the mean by c deviations, however far it is: no measurement is ignored.
+    What is far off moves the mean by c deviations, however far it is, up to `FAR`.
 
     Args:
         threshold: c, standard deviations at the start; learned.

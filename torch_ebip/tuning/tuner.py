@@ -258,6 +258,7 @@ class Tuner:
             "samples": interactions,
             "masks": masks,
             "filter": f"{type(self.filter).__name__}({self.filter.extra_repr()})",
+            "robust": None if self.filter.noise.robust is None else repr(self.filter.noise.robust),
             "objective_weights": list(self.objective.weights),
             "filter_buffers": _fingerprint(self.filter),
             "objective_buffers": _fingerprint(self.objective),
