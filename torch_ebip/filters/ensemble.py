@@ -19,8 +19,8 @@ from torch_ebip.noise.pair import FilterNoise
 from torch_ebip.noise.process import InteractionNoise
 
 MOST_GROWTH = 10.0
-"""What all inflations of one interaction may come to. They enlarge what no sensor reduces, and an interaction lasts a
-hundred samples; a filter that is left running must not end in infinity."""
+"""What all inflations of one interaction may come to. Weights have no dynamics that would draw in what no sensor
+reduces, and an interaction lasts a hundred samples; a filter that is left running must not end in infinity."""
 
 
 class EnsembleFilter(MemberFilter):
@@ -37,8 +37,8 @@ class EnsembleFilter(MemberFilter):
         dt: seconds between samples where none is given.
         square_root: deterministic update instead of perturbed observations.
         inflation: factor on the anomalies after each update that measured something; a number, or a
-            module with a ``value`` such as `AboveOne` to learn it. All of an interaction together come to at most
-            `MOST_GROWTH`.
+            module with a ``value`` such as `AboveOne` to learn it. With the phase dynamics of an interaction all of
+            them together come to at most `MOST_GROWTH`.
         localisation: factors on the cross-covariances of blocks of the state.
         weighting: weigh members by the evidence for the demonstrations they came from; default: all alike.
             Needs a state of phase, phase velocity and weights.
@@ -133,9 +133,10 @@ class EnsembleFilter(MemberFilter):
             evidence = self.weighting.learn(evidence, paths, y, observed, phase, columns, trust)
         factor = torch.diag_embed(deviation)
         inflation, growth = None, state.growth
-        if growth is not None:
-            inflation = self._inflate(growth, observed.any(-1) if trust is None else trust.amax(-1))
-            growth = growth * inflation
+        if self.inflation is not None:
+            share = observed.any(-1).to(members) if trust is None else trust.amax(-1)
+            inflation = self._inflate(growth, share)
+            growth = None if growth is None else growth * inflation
         try:
             if self.square_root:
                 updated, likelihood = functional.square_root_update(
@@ -166,15 +167,16 @@ class EnsembleFilter(MemberFilter):
         return functional.ensemble_mean(phases.unsqueeze(-1), state.weights).squeeze(-1), projections, paths
 
     def _grown(self, state: EnsembleState) -> Tensor | None:
-        """All inflations so far, [...]; a state that somebody made himself has had none."""
-        if self.inflation is None or state.growth is not None:
-            return None if self.inflation is None else state.growth
-        return state.members.new_ones(state.members.shape[:-2])
+        """All inflations of an interaction so far, [...]; 1 for a state made by hand; None if they have no bound."""
+        if self.inflation is None or not isinstance(self.dynamics, ConstantVelocityPhase):
+            return None
+        return state.members.new_ones(state.members.shape[:-2]) if state.growth is None else state.growth
 
-    def _inflate(self, growth: Tensor, share: Tensor) -> Tensor:
+    def _inflate(self, growth: Tensor | None, share: Tensor) -> Tensor:
         """Inflation [...] after a sample that counts for a share [...] of one, in [0, 1], on top of earlier ones."""
-        whole: Tensor = self._inflation_factor(growth) ** self.thinning
-        return torch.minimum(1 + (whole - 1) * share.to(growth), (MOST_GROWTH / growth).clamp(min=1))
+        whole: Tensor = self._inflation_factor(share) ** self.thinning
+        inflation = 1 + (whole - 1) * share
+        return inflation if growth is None else torch.minimum(inflation, (MOST_GROWTH / growth).clamp(min=1))
 
     def _inflation_factor(self, members: Tensor) -> Tensor:
         value = self.inflation.value if isinstance(self.inflation, nn.Module) else self.inflation

@@ -25,7 +25,7 @@ class EnsembleState(NamedTuple):
     Attributes:
         members: [..., E, n].
         evidence: what weights of the members rest on; None where all count alike.
-        growth: [...], product of all inflations so far; None where there is none.
+        growth: [...], product of all inflations so far; None where there is none, or no bound on it.
     """
 
     members: Tensor
