@@ -28,7 +28,7 @@ from experiments.data import load
 from experiments.folds import split
 from experiments.run_folder import RunFolder, read_json, save_figure, write_json
 from experiments.soak.stream import Sample, stream
-from experiments.soak.subjects import SHARES, SUBJECTS, Subject
+from experiments.soak.subjects import DEFAULT, SHARES, SUBJECTS, Subject
 from experiments.soak.watch import Window, relative_time, verdict, watch
 from torch_ebip import BSplineBasis, InteractionPrimitive, StackedBasis
 
@@ -167,7 +167,9 @@ def _parser() -> argparse.ArgumentParser:
     slow = ", ".join(f"{name} {share:g}" for name, share in SHARES.items())
     parser.add_argument("--data", metavar="FILE.npz", help="recordings in the project's format (default: simulated)")
     parser.add_argument("--steps", type=int, default=1_000_000, help=f"of each; of some a share: {slow}")
-    parser.add_argument("--filters", nargs="+", choices=list(SUBJECTS), default=list(SUBJECTS), help="default: all")
+    parser.add_argument(
+        "--filters", nargs="+", choices=list(SUBJECTS), default=list(DEFAULT), help=f"default: {', '.join(DEFAULT)}"
+    )
     add_run_options(parser, "soak", "data, splits and draws", "a small run")
     return parser
 

@@ -73,14 +73,18 @@ class _Watched:
 
 
 class Live:
-    """A live filter, one for all time."""
+    """A live filter: one for all time, or a new one for each interaction."""
 
-    def __init__(self, filter: EnsembleFilter, sensors: Tensor, seed: int) -> None:
+    def __init__(self, filter: EnsembleFilter, sensors: Tensor, seed: int, anew: bool = False) -> None:
+        self._filter, self._sensors, self._anew = filter, sensors, anew
+        self._generator = torch.Generator().manual_seed(seed)
         self._watched = _Watched(filter)
-        self._live = LiveFilter(filter, sensors, generator=torch.Generator().manual_seed(seed))
+        self._live = LiveFilter(filter, sensors, generator=self._generator)
 
     def begin(self) -> None:
         """See `Subject`."""
+        if self._anew:
+            self._live = LiveFilter(self._filter, self._sensors, generator=self._generator)
 
     def step(self, sample: Sample) -> None:
         """See `Subject`."""
@@ -176,12 +180,16 @@ def _square_root(primitive: InteractionPrimitive) -> EnsembleFilter:
 SUBJECTS: dict[str, Callable[[InteractionPrimitive, Tensor, int], Subject]] = {
     "closed_form": lambda primitive, sensors, seed: Live(ebip(primitive), sensors, seed),
     "square_root": lambda primitive, sensors, seed: Live(_square_root(primitive), sensors, seed),
-    "tuned": lambda primitive, sensors, seed: Live(tunable(primitive, START), sensors, seed),
+    "tuned": lambda primitive, sensors, seed: Live(tunable(primitive, START), sensors, seed, anew=True),
+    "tuned_endless": lambda primitive, sensors, seed: Live(tunable(primitive, START), sensors, seed),
     "sessions": lambda primitive, sensors, seed: Sessions(tunable(primitive, START), primitive, sensors),
     "particle": lambda primitive, sensors, seed: Steps(particle_filter(primitive, weight_noise=0.05), sensors, seed),
     "bip": lambda primitive, sensors, seed: Steps(bip(primitive), sensors, seed),
 }
-"""By name. `closed_form` is the paper's, `square_root` is weighted and has R over phase, `tuned` also inflates. None
-is ever begun again, for them all interactions are one, but for `sessions`, each of which is an interaction."""
+"""By name. `closed_form` is the paper's, `square_root` is weighted and has R over phase, `tuned` also inflates and,
+as it is used, is begun anew with each interaction; so is a session. To the others all interactions are one without
+end. That `tuned_endless` does not stand: members of little weight leave the others more and more, until S cannot be
+factored."""
+DEFAULT = ("closed_form", "tuned", "sessions", "particle", "bip")
 SHARES = {"particle": 0.2, "bip": 0.1, "sessions": 0.1}
 """Of the steps that are asked for, where they are slow and have no state or a small one that could drift."""
