@@ -111,9 +111,10 @@ NAMED = r"cannot be factored|not finite|hold NaN"
 """What errors say that say what is wrong with numbers."""
 
 
-def is_named(error: ValueError) -> bool:
-    """Whether an error does."""
-    return re.search(NAMED, str(error)) is not None
+def assert_allowed(error: ValueError, case: Case) -> None:
+    """Errors say what is wrong, and come only where R is at its floor."""
+    assert case.floored
+    assert re.search(NAMED, str(error))
 
 
 WILD = 1e3
@@ -141,8 +142,7 @@ def test_finite_or_a_named_error(case: Case) -> None:
     except ValueError as error:
         failure = error
     if failure is not None:
-        assert case.floored
-        assert is_named(failure)
+        assert_allowed(failure, case)
         return
     forecast = made.forecast(trace.state, torch.tensor([0.5, 1.0], dtype=case.dtype))
     values: list[Tensor] = [trace.phase, trace.log_likelihood, trace.projection, forecast.mean, forecast.variance]
@@ -176,8 +176,7 @@ def test_the_live_filter(case: Case) -> None:
     except ValueError as error:
         failure = error
     if failure is not None:
-        assert case.floored
-        assert is_named(failure)
+        assert_allowed(failure, case)
         return
     if not live.finite:  # it says so: members so large that their variance would not be
         assert case.floored
