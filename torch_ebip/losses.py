@@ -34,14 +34,14 @@ class TrajectoryLoss(nn.Module):
 
     def forward(self, predicted: Tensor, target: Tensor) -> Tensor:
         """From predicted and target [..., D] (phases and batches in front), units of the DoFs: unitless scalar."""
-        predicted, target, measured = self._scaled(predicted, target)
-        return (predicted - target).square().mul(measured).sum() / measured.sum().clamp(min=1)
+        error, measured = self._errors(predicted, target)
+        return error.square().mul(measured).sum() / measured.sum().clamp(min=1)
 
-    def _scaled(self, predicted: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _errors(self, predicted: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        """Predicted less target in units of the scale, and which targets were measured."""
         target = target[..., self.dofs]
         measured = ~target.isnan()
-        scale = self.scale[self.dofs]
-        return predicted[..., self.dofs] / scale, torch.where(measured, target, 0) / scale, measured
+        return (predicted[..., self.dofs] - torch.where(measured, target, 0)) / self.scale[self.dofs], measured
 
 
 class CRPSLoss(TrajectoryLoss):
@@ -58,8 +58,10 @@ class CRPSLoss(TrajectoryLoss):
         Returns:
             scalar, without unit.
         """
-        members, target, measured = self._scaled(predicted, target)
-        return crps(members, target, weights).mul(measured).sum() / measured.sum().clamp(min=1)
+        errors, measured = self._errors(predicted, target.unsqueeze(-2))
+        measured = measured.squeeze(-2)
+        scores = crps(errors, torch.zeros_like(errors[..., 0, :]), weights)
+        return scores.mul(measured).sum() / measured.sum().clamp(min=1)
 
 
 class EnergyScoreLoss(TrajectoryLoss):
@@ -70,9 +72,9 @@ class EnergyScoreLoss(TrajectoryLoss):
 
     def forward(self, predicted: Tensor, target: Tensor) -> Tensor:
         """From predicted members [..., E, D] and target [..., D], units of the DoFs: scalar, without unit."""
-        members, target, measured = self._scaled(predicted, target)
-        members = torch.where(measured.unsqueeze(-2), members, 0)
-        return energy_score(members, target).mean()
+        errors, measured = self._errors(predicted, target.unsqueeze(-2))
+        errors = torch.where(measured, errors, 0)
+        return energy_score(errors, torch.zeros_like(errors[..., 0, :])).mean()
 
 
 class InnovationLikelihoodLoss(nn.Module):

@@ -11,6 +11,7 @@ from torch_ebip.basis.regression import (
     Samples,
     correlation_time,
     mean_squared_residual,
+    measured_variance,
     regress,
     samples_of,
 )
@@ -92,6 +93,7 @@ class InteractionPrimitive(nn.Module):
                     "of the basis"
                 )
         samples = samples_of(demonstrations)
+        resolution = torch.finfo(demonstrations[0].dtype).eps
         weights = samples.values.new_empty(len(demonstrations), basis.n_weights)
         variance = samples.values.new_empty(layout.n_dofs)
         correlation = samples.values.new_empty(layout.n_dofs)
@@ -103,7 +105,7 @@ class InteractionPrimitive(nn.Module):
                 weights[:, basis.weight_slices[dof]] = fit.weights[:, i]
             variance[dofs] = mean_squared_residual(fit, part).nanmean(0)
             correlation[dofs] = correlation_time(fit, part)
-        spread = _measured_variance(samples)
+        spread = measured_variance(samples, resolution)
         # A DoF that is fitted exactly would have R = 0, and with it a singular innovation covariance. What floor is
         # small depends on its unit, which its spread tells, its size if it never moves, and nothing if it is 0.
         size = torch.where(samples.observed, samples.values, 0).square().amax((0, 1))
@@ -131,7 +133,7 @@ class InteractionPrimitive(nn.Module):
     def end_variance(self) -> Tensor:
         """[D]: variance over demonstrations of the value at phase 1."""
         one = torch.ones(len(self), dtype=self.weights.dtype, device=self.weights.device)
-        return self.basis.project(one, self.weights).var(0)
+        return self.basis.project(one, self.weights - self.weights.mean(0)).var(0)
 
     def subset(self, indices: Tensor) -> InteractionPrimitive:
         """The same basis and noise with some of the demonstrations, int64 [M]: they need no new regression."""
@@ -145,13 +147,3 @@ class InteractionPrimitive(nn.Module):
             self.residual_correlation_time,
             self.value_variance,
         )
-
-
-def _measured_variance(samples: Samples) -> Tensor:
-    count = samples.observed.sum((0, 1))
-    values = torch.where(samples.observed, samples.values, 0)
-    mean = values.sum((0, 1)) / count
-    deviation = torch.where(samples.observed, samples.values - mean, 0)
-    variance = deviation.square().sum((0, 1)) / count
-    # What a constant leaves by rounding is not a scale to measure anything by.
-    return torch.where(variance > 1e-12 * mean.square(), variance, 0)

@@ -28,12 +28,14 @@ def crps(members: Tensor, target: Tensor, weights: Tensor | None = None, fair: b
     if weights is None:
         weights = members.new_full(members.shape[-2:-1], 1 / E)
     shares = weights.unsqueeze(-1).expand(members.shape)
-    ordered, order = members.sort(dim=-2)
+    # From the target on: the sums below cancel, and would lose what lies far from 0.
+    distances = members - target.unsqueeze(-2)
+    ordered, order = distances.sort(dim=-2)
     sorted_shares = shares.gather(-2, order)
     below = sorted_shares.cumsum(-2) - sorted_shares / 2
     # Half of sum_jk w_j w_k |x_j - x_k| is sum_j w_j x_(j) (2 W_j - 1), W_j the weight up to the middle of j.
     spread = (sorted_shares * (2 * below - 1) * ordered).sum(-2)
-    error = (shares * (members - target.unsqueeze(-2)).abs()).sum(-2)
+    error = (shares * distances.abs()).sum(-2)
     return error - (spread / (1 - weights.square().sum(-1, keepdim=True)) if fair else spread)
 
 

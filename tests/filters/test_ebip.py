@@ -231,7 +231,7 @@ def test_members_that_ran_past_the_end_are_called_back(square_root: bool, factor
 def test_a_failing_factorisation_names_the_dofs() -> None:
     made = ebip(small_primitive())
     state = made.initial_state()
-    state.members[0, 2] = torch.nan
+    state.deviations[0, 2] = torch.nan
     with pytest.raises(ValueError, match=r"hand\.x"):
         made.update(state, torch.zeros(5))
 

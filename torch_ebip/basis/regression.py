@@ -83,7 +83,13 @@ def regress(basis: Basis, samples: Samples) -> Fit:
     moments = (weight * samples.values.transpose(-1, -2)) @ features
     # Relative to the trace, 1e-12 is above rounding and far below any effect on the fit.
     ridge = 1e-12 * gram.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * torch.eye(count).to(gram)
-    weights = torch.cholesky_solve(moments.unsqueeze(-1), torch.linalg.cholesky(gram + ridge)).squeeze(-1)
+    factor = torch.linalg.cholesky(gram + ridge)
+    weights = torch.cholesky_solve(moments.unsqueeze(-1), factor).squeeze(-1)
+    # Once more for what is left: values that lie far from 0 leave by ridge and rounding what matters beside their
+    # spread (iterative refinement).
+    left = samples.values - features @ weights.transpose(-1, -2)
+    correction = ((weight * left.transpose(-1, -2)) @ features).unsqueeze(-1)
+    weights = weights + torch.cholesky_solve(correction, factor).squeeze(-1)
     absent = ~samples.observed.any(1)
     if absent.any():
         share = (~absent).to(weights) / (~absent).sum(0).to(weights)
@@ -95,6 +101,22 @@ def regress(basis: Basis, samples: Samples) -> Fit:
 def mean_squared_residual(fit: Fit, samples: Samples) -> Tensor:
     """[N, D]: each demonstration's mean squared residual over its measured samples; NaN where it has none."""
     return fit.residuals.square().sum(1) / samples.observed.sum(1)
+
+
+def measured_variance(samples: Samples, resolution: float) -> Tensor:
+    """[D]: variance of each DoF over all measured samples; 0 for a constant.
+
+    Args:
+        samples: of all demonstrations.
+        resolution: relative, of the dtype that the values had: what a constant leaves by it is no scale to measure
+            anything by.
+    """
+    count = samples.observed.sum((0, 1))
+    values = torch.where(samples.observed, samples.values, 0)
+    mean = values.sum((0, 1)) / count
+    deviation = torch.where(samples.observed, samples.values - mean, 0)
+    variance = deviation.square().sum((0, 1)) / count
+    return torch.where(variance > (resolution * mean).square(), variance, 0)
 
 
 def correlation_time(fit: Fit, samples: Samples) -> Tensor:

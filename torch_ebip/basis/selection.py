@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
 from torch_ebip.basis.base import Basis
 from torch_ebip.basis.bspline import BSplineBasis
 from torch_ebip.basis.gaussian import GaussianBasis
 from torch_ebip.basis.polynomial import PolynomialBasis
-from torch_ebip.basis.regression import Samples, mean_squared_residual, regress, samples_of
+from torch_ebip.basis.regression import Samples, mean_squared_residual, measured_variance, regress, samples_of
 from torch_ebip.basis.sigmoid import SigmoidBasis
 from torch_ebip.basis.stacked import StackedBasis
 from torch_ebip.demonstrations import Demonstrations
@@ -98,18 +99,21 @@ def rank_candidates(demonstrations: Demonstrations, candidates: Sequence[Basis] 
             "is small enough for it"
         )
     samples = samples_of(demonstrations)
-    rows = [row for basis in usable for row in _fit(demonstrations.layout, basis, samples)]
+    # A DoF that never moves is fitted exactly by any basis: the floor keeps its logarithm finite. It is one of the
+    # spread, because where the origin lies says nothing; and of the size where there is no spread.
+    spread = measured_variance(samples, torch.finfo(demonstrations[0].dtype).eps)
+    size = torch.where(samples.observed, samples.values, 0).square().mean((0, 1))
+    floor = 1e-12 * torch.where(spread > 0, spread, size) + 1e-300
+    rows = [row for basis in usable for row in _fit(demonstrations.layout, basis, samples, floor)]
     order = demonstrations.layout.names
     return sorted(rows, key=lambda row: (order.index(row.modality), row.bic))
 
 
-def _fit(layout: Layout, basis: Basis, samples: Samples) -> list[CandidateFit]:
-    """One batched regression for all DoFs, one row for each modality."""
+def _fit(layout: Layout, basis: Basis, samples: Samples, floor: Tensor) -> list[CandidateFit]:
+    """One batched regression for all DoFs, one row for each modality; residual variances above a floor [D]."""
     fit = regress(basis, samples)
     counts = samples.observed.sum(1)
     n = counts.to(samples.values)
-    # A DoF that never moves is fitted exactly by any basis: the floor keeps its logarithm finite.
-    floor = 1e-12 * samples.values.square().mean((0, 1)) + 1e-300
     terms = n * (mean_squared_residual(fit, samples) + floor).log() + basis.n_features * n.log()
     bic = torch.where(counts > 0, terms, 0).sum(0)
     steps = torch.arange(samples.observed.shape[1]).to(counts).view(1, -1, 1)

@@ -88,18 +88,23 @@ class StackedBasis(nn.Module):
             raise ValueError(f"dofs must be bool [{self.n_dofs}], got {dofs.dtype} {tuple(dofs.shape)}")
         return StackedBasis([basis for basis, chosen in zip(self.bases, dofs.tolist(), strict=True) if chosen])
 
-    def project(self, phase: Tensor, weights: Tensor, dofs: Sequence[int] | None = None) -> Tensor:
+    def project(
+        self, phase: Tensor, weights: Tensor, dofs: Sequence[int] | None = None, centre: Tensor | None = None
+    ) -> Tensor:
         """h(phi, w), a phase for each set of weights.
 
         Args:
             phase: [...].
             weights: [..., n_weights], of a shape that broadcasts with the phases.
             dofs: ascending indices of the k DoFs that are wanted; default: all D.
+            centre: [..., n_weights], to be added to E sets of weights [..., E, n_weights]; default: nothing.
 
         Returns:
             [..., k], units of the DoFs.
         """
-        return self._project([basis(phase) for basis in self.families], weights, dofs)
+        features = [basis(phase) for basis in self.families]
+        projections = self._project(features, weights, dofs)
+        return projections if centre is None else projections + self._paths(features, centre, dofs)
 
     def project_derivative(self, phase: Tensor, weights: Tensor) -> Tensor:
         """dh/dphi, shapes as `project`: the first column of the paper's Jacobian (equation of H_t)."""
@@ -136,15 +141,7 @@ class StackedBasis(nn.Module):
         Returns:
             [..., P, k].
         """
-        features = [basis(phase) for basis in self.families]
-        parts = []
-        for run, block in zip(self._runs, self._blocks(weights), strict=True):
-            wanted = run.wanted(dofs)
-            if wanted:
-                functions = features[run.basis]
-                block = _select(block, run, wanted)
-                parts.append(functions @ block.transpose(-1, -2))
-        return torch.cat(parts, dim=-1)
+        return self._paths([basis(phase) for basis in self.families], weights, dofs)
 
     def project_covariance(self, phase: Tensor, covariance: Tensor) -> Tensor:
         """Variance of h(phi, w) for normal weights, Phi_d Sigma_dd Phi_d' for each DoF d.
@@ -166,6 +163,15 @@ class StackedBasis(nn.Module):
             own = blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)
             parts.append(torch.einsum("...pa,...kab,...pb->...pk", functions, own, functions))
         return torch.cat(parts, dim=-1)
+
+    def _paths(self, features: Sequence[Tensor], weights: Tensor, dofs: Sequence[int] | None) -> Tensor:
+        parts = []
+        for run, block in zip(self._runs, self._blocks(weights), strict=True):
+            wanted = run.wanted(dofs)
+            if wanted:
+                block = _select(block, run, wanted)
+                parts.append(features[run.basis] @ block.transpose(-1, -2))
+        return torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0]
 
     def _project(self, features: Sequence[Tensor], weights: Tensor, dofs: Sequence[int] | None) -> Tensor:
         parts = []

@@ -74,13 +74,21 @@ class BasisProjection(nn.Module):
         """Projections [..., E, D] of members [..., E, n]."""
         return self.rows(members, None)
 
-    def rows(self, members: Tensor, dofs: Sequence[int] | None) -> Tensor:
-        """Projections [..., E, k] of members [..., E, n], of some dofs (ascending indices; None for all)."""
+    def rows(self, members: Tensor, dofs: Sequence[int] | None, centre: Tensor | None = None) -> Tensor:
+        """Projections [..., E, k] of members [..., E, n], of some dofs (ascending indices; None for all).
+
+        With a centre [..., n] of members that are deviations from it.
+        """
         phase, _, weights = split_state(members)
-        return self.basis.project(phase.squeeze(-1), weights, dofs)
+        return self.basis.project(phase.squeeze(-1), weights, dofs, None if centre is None else centre[..., 2:])
 
     def measure(
-        self, members: Tensor, dofs: Sequence[int] | None, others: Tensor | None, offsets: Tensor | None
+        self,
+        members: Tensor,
+        dofs: Sequence[int] | None,
+        others: Tensor | None,
+        offsets: Tensor | None,
+        centre: Tensor | None = None,
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """What an update needs to know of members, in one pass over them.
 
@@ -89,6 +97,7 @@ class BasisProjection(nn.Module):
             dofs: ascending indices of k DoFs; None for all.
             others: weights [..., E, n_weights] to be projected at the members' phases too; default: none.
             offsets: [O], added to the phases for these; what lies beyond the interval is moved to its ends.
+            centre: [..., n], to which the members are deviations; its phase is 0; default: they are none.
 
         Returns:
             Phases [..., E], projections [..., E, k], and those of the others, [..., E, O, k].
@@ -98,7 +107,8 @@ class BasisProjection(nn.Module):
         if others is not None and offsets is not None:
             paths = self.basis.project_paths((phase + offsets).clamp(0, 1), others, dofs)
         phase = phase.squeeze(-1)
-        return phase, self.basis.project(phase, weights, dofs), paths
+        middle = None if centre is None else centre[..., 2:]
+        return phase, self.basis.project(phase, weights, dofs, middle), paths
 
     def phase(self, members: Tensor) -> Tensor:
         """Phase [..., E] of each of the members [..., E, n]."""

@@ -98,13 +98,18 @@ class LiveFilter:
         self._basis = part.observation.basis
         self._sensors = {dof: row for row, dof in enumerate(dofs.nonzero().squeeze(-1).tolist())}
         state = filter.initial_state(batch_shape, members, generator) if state is None else state
-        self._start = start = state.members
+        if state.centre is None:  # made by hand
+            state = filter._taken_out(state)
+        start, centre = state.deviations, state.centre
+        assert centre is not None  # a model with a live path has one
+        self._start: Tensor = start
+        self._centre: Tensor = centre
         self._evidence = state.evidence
         self._origin = None if state.evidence is None else state.evidence.origin
         columns = self._columns(dofs)
         if state.evidence is not None:
             self._evidence = state.evidence._replace(origin=state.evidence.origin[..., columns])
-        self._span = SpanMembers(start, columns)
+        self._span, self._middle = SpanMembers(start, columns), centre[..., 2 + columns]
         self._members = self._span.matrix
         self._phase, self._velocity = self._members[..., 0, :], self._members[..., 1, :]
         self._moving = self._members[..., :2, :]
@@ -242,8 +247,11 @@ class LiveFilter:
         weights = None if self._evidence is None else self._evidence.weights.unsqueeze(-1)
         even = self._equal if weights is None else weights
         projections = plan.project(self._phase)
-        mean = projections @ even
-        anomalies = torch.sub(projections, mean, out=plan.anomalies)
+        # Differences from one of the members first: the mean of values far from 0 is not exact enough.
+        reference = projections[..., :1]
+        anomalies = torch.sub(projections, reference, out=plan.anomalies)
+        shift = anomalies @ even
+        anomalies.sub_(shift)
         deviation, R = plan.measurement_noise(self._deviations)
         seen = None
         if mask is not None:
@@ -258,7 +266,7 @@ class LiveFilter:
             plan.check_finite(seen)
             spread = share * (anomalies * weighted.transpose(-1, -2)).sum(-1, keepdim=True)
             here = values if seen is None else torch.where(seen, values, 0)
-            values, wider, trust = self._robust(here, mean, spread, deviation, self.filter.thinning)
+            values, wider, trust = self._robust(here, reference + shift, spread, deviation, self.filter.thinning)
             if seen is not None:
                 wider, trust = torch.where(seen, wider, 0), torch.where(seen, trust, 0)
             R = R + torch.diag_embed((wider.square() - deviation.square())[..., 0])
@@ -267,7 +275,7 @@ class LiveFilter:
         factor, info = torch.linalg.cholesky_ex(S)
         if bool(info.any() if self.batch_shape else info):
             self._explain(S, plan)
-        residual = torch.sub(values, mean, out=plan.right_mean)
+        residual = torch.sub(values, reference, out=plan.right_mean).sub_(shift)
         if seen is not None:
             residual.masked_fill_(~seen, 0)
         if self.filter.square_root:
@@ -324,7 +332,7 @@ class LiveFilter:
             )
         if not dofs:
             return None
-        return Plan(self._basis, self._span, dofs, [self._sensors[dof] for dof in dofs], self._terms)
+        return Plan(self._basis, self._span, self._middle, dofs, [self._sensors[dof] for dof in dofs], self._terms)
 
     def _learn(self, evidence: Evidence, plan: Plan, values: Tensor, seen: Tensor, counts: Tensor | None) -> None:
         weighting = self._part.weighting
@@ -351,11 +359,12 @@ class LiveFilter:
         return (self.filter if all(chosen) else self.filter.restrict(dofs)), self._columns(dofs)
 
     def _state(self, columns: Tensor, entry: int | None = None) -> EnsembleState:
-        evidence, origin, growth = self._evidence, self._origin, self._growth
-        if growth is not None and entry is not None:
-            growth = growth[entry]
+        evidence, origin, growth, centre = self._evidence, self._origin, self._growth, self._centre
+        if entry is not None:
+            growth, centre = None if growth is None else growth[entry], centre[entry]
         if evidence is not None and origin is not None:
             if entry is not None:
                 evidence, origin = Evidence(*(part[entry] for part in evidence)), origin[entry]
             evidence = evidence._replace(origin=origin[..., columns])
-        return EnsembleState(self._span.members(columns, entry), evidence, growth)
+        centre = torch.cat([centre[..., :2], centre[..., 2 + columns]], dim=-1)
+        return EnsembleState(self._span.members(columns, entry), evidence, growth, centre)

@@ -22,15 +22,25 @@ from torch_ebip.noise.process import InteractionNoise
 class EnsembleState(NamedTuple):
     """An ensemble.
 
+    What of a state stands still between measurements is stored as deviations from the mean of the first ensemble:
+    float32 then holds how members differ, not where they are. `EnsembleState(members)` is a state made by hand.
+
     Attributes:
-        members: [..., E, n].
+        deviations: [..., E, n], the members less the centre.
         evidence: what weights of the members rest on; None where all count alike.
         growth: [...], product of all inflations so far; None where there is none, or no bound on it.
+        centre: [..., n], never changed by a step, 0 where the dynamics move a state; None: nothing was taken out.
     """
 
-    members: Tensor
+    deviations: Tensor
     evidence: Evidence | None = None
     growth: Tensor | None = None
+    centre: Tensor | None = None
+
+    @property
+    def members(self) -> Tensor:
+        """[..., E, n], with the centre."""
+        return self.deviations if self.centre is None else self.deviations + self.centre.unsqueeze(-2)
 
     @property
     def weights(self) -> Tensor | None:
@@ -40,18 +50,20 @@ class EnsembleState(NamedTuple):
     @property
     def mean(self) -> Tensor:
         """[..., n]."""
-        return functional.ensemble_mean(self.members, self.weights)
+        mean = functional.ensemble_mean(self.deviations, self.weights)
+        return mean if self.centre is None else mean + self.centre
 
     @property
     def covariance(self) -> Tensor:
         """[..., n, n], A'A / (E - 1), or its weighted form."""
-        return functional.ensemble_covariance(self.members, self.weights)
+        return functional.ensemble_covariance(self.deviations, self.weights)
 
 
 class MemberFilter(Filter):
     """Means, phases and forecasts of members; a subclass says how they are predicted and updated.
 
-    Its states have ``members`` [..., E, n] and ``weights`` [..., E], None where all members count alike.
+    Its states begin with members [..., E, n] or their deviations from a centre [..., n], and have ``weights``
+    [..., E], None where all members count alike.
 
     Args:
         dynamics: g, maps members [..., E, n] and dt [...] to members.
@@ -96,28 +108,33 @@ class MemberFilter(Filter):
 
     def project(self, state: State) -> Tensor:
         """See `Filter.project`."""
-        return functional.ensemble_mean(self.observation(state.members), state.weights)
+        return functional.ensemble_mean(self._project_rows(state, None), state.weights)
 
     def phase(self, state: State) -> Tensor:
         """See `Filter.phase`."""
         phase = self._phase_or_none(state)
         if phase is not None:
             return phase
-        members: Tensor = state.members
+        members: Tensor = state[0]
         return members[..., 0, 0] * torch.nan
 
-    def _project_rows(self, members: Tensor, rows: Tensor | None) -> Tensor:
-        """h [..., E, k] of members, for some DoFs int64 [k], ascending; None for all."""
-        if rows is not None and isinstance(self.observation, BasisProjection):
-            return self.observation.rows(members, rows.tolist())
-        projections: Tensor = self.observation(members)
+    def _centre(self, state: State) -> Tensor | None:
+        """What the members of a state are deviations from, [..., n]; None if they are none."""
+        return None
+
+    def _project_rows(self, state: State, rows: Tensor | None) -> Tensor:
+        """h [..., E, k] of the members, for some DoFs int64 [k], ascending; None for all."""
+        if isinstance(self.observation, BasisProjection):
+            dofs = None if rows is None else rows.tolist()
+            return self.observation.rows(state[0], dofs, self._centre(state))
+        projections: Tensor = self.observation(state.members)
         return projections if rows is None else projections[..., rows]
 
     def _phase_or_none(self, state: State) -> Tensor | None:
         phase_of: Callable[[Tensor], Tensor] | None = getattr(self.observation, "phase", None)
         if phase_of is None:
             return None
-        return functional.ensemble_mean(phase_of(state.members).unsqueeze(-1), state.weights).squeeze(-1)
+        return functional.ensemble_mean(phase_of(state[0]).unsqueeze(-1), state.weights).squeeze(-1)
 
     def forecast_members(self, state: State, phase: Tensor) -> Tensor:
         """Each member's trajectory, [..., P, E, D], that a state implies at a phase [P] or [..., P].
@@ -125,11 +142,17 @@ class MemberFilter(Filter):
         Raises:
             TypeError: the observation knows no phase.
         """
+        departures, path = self._paths_ahead(state, phase)
+        return departures if path is None else departures + path
+
+    def _paths_ahead(self, state: State, phase: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Each member's trajectory [..., P, E, D] as it differs from that of the centre, [..., P, 1, D], if any."""
         project_at: Callable[[Tensor, Tensor], Tensor] | None = getattr(self.observation, "at", None)
         if project_at is None:
             raise TypeError(f"{type(self.observation).__name__} knows no phase to forecast along: it has no `at`")
-        batch = state.members.shape[:-2]
-        return project_at(state.members, phase.to(state.members).expand(*batch, -1))
+        members, centre = state[0], self._centre(state)
+        phase = phase.to(members).expand(*members.shape[:-2], -1)
+        return project_at(members, phase), None if centre is None else project_at(centre.unsqueeze(-2), phase)
 
     def forecast(self, state: State, phase: Tensor | None = None) -> Forecast:
         """Steps 4 and 5 of the paper's box: mean and variance over members of h at phases to come.
@@ -138,9 +161,12 @@ class MemberFilter(Filter):
         See `Filter.forecast`.
         """
         phase = self._phases_ahead(state) if phase is None else phase
-        members = self.forecast_members(state, phase)
-        phase = phase.to(members).expand(members.shape[:-2])
-        weights = None if state.weights is None else state.weights.unsqueeze(-2).expand(members.shape[:-1])
-        mean = functional.ensemble_mean(members, weights)
-        variance = functional.ensemble_variance(members, weights, self.fair)
+        departures, path = self._paths_ahead(state, phase)
+        phase = phase.to(departures).expand(departures.shape[:-2])
+        weights = None if state.weights is None else state.weights.unsqueeze(-2).expand(departures.shape[:-1])
+        mean = functional.ensemble_mean(departures, weights)
+        variance = functional.ensemble_variance(departures, weights, self.fair)
+        members = departures
+        if path is not None:
+            mean, members = mean + path.squeeze(-2), departures + path
         return Forecast(mean, variance, phase, members, weights, self.fair)

@@ -74,7 +74,9 @@ class MixturePrior(nn.Module):
         correction = (count / (count - 1)) ** 0.5 if self.responsibilities.shape[1] == 1 else 1.0
         draws = standard_normal(share.shape, states, generator) * share.sqrt() * correction
         combination = share + draws - draws.sum(-1, keepdim=True) * share
-        weights = combination @ states[..., 2:]
+        # Rows of the combination sum to 1 but for rounding: what it combines is centred first.
+        middle = states[..., 2:].mean(-2, keepdim=True)
+        weights = middle + combination @ (states[..., 2:] - middle)
         velocity = states[..., 1]
         deviation = velocity.std(-1, keepdim=True)
         speeds = velocity.mean(-1, keepdim=True) + deviation * standard_normal(size, states, generator)

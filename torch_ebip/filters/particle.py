@@ -138,7 +138,7 @@ class ParticleFilter(MemberFilter):
         rows = measured.nonzero().squeeze(-1)
         deviation = self._deviation(self._phase_or_none(state))[..., rows]
         y, observed = torch.where(observed, y, 0)[..., rows], observed[..., rows]
-        projections = self._project_rows(state.members, rows)
+        projections = self._project_rows(state, rows)
         if self.noise.robust is not None:
             mean = functional.ensemble_mean(projections, state.weights)
             spread = functional.ensemble_variance(projections, state.weights, unbiased=False)

@@ -23,6 +23,7 @@ class _Range(NamedTuple):
 
     family: int
     weights: Tensor  # view of the members, [..., k, F, E]
+    centre: Tensor  # to which they are deviations, [..., k, F]
     terms: Tensor  # buffer of the same shape
     projections: Tensor  # [..., k, E], view of the plan's
 
@@ -33,6 +34,7 @@ class Plan:
     Args:
         basis: of the sensors' DoFs.
         span: the members.
+        centre: [..., n_weights] of the basis, to which they are deviations.
         dofs: K of them, numbered as in the filter.
         rows: the same, numbered as in the basis, ascending.
         terms: buffer as large as all weights that sensors see, shared by all plans.
@@ -49,7 +51,13 @@ class Plan:
     """
 
     def __init__(
-        self, basis: StackedBasis, span: SpanMembers, dofs: Sequence[int], rows: Sequence[int], terms: Tensor
+        self,
+        basis: StackedBasis,
+        span: SpanMembers,
+        centre: Tensor,
+        dofs: Sequence[int],
+        rows: Sequence[int],
+        terms: Tensor,
     ) -> None:
         like, K = span.matrix, len(rows)
         batch, E = like.shape[:-2], like.shape[-1]
@@ -63,6 +71,7 @@ class Plan:
         self.right, self.solved = (like.new_empty(*batch, E + 1, K).transpose(-1, -2) for _ in range(2))
         self.right_members, self.right_mean = self.right[..., :E], self.right[..., E:]
         self.moves, self.shift = self.solved[..., :E], self.solved[..., E:]
+        self._add_product: Callable[..., Tensor] = Tensor.baddbmm_ if batch else Tensor.addmm_
         self.one = like.new_ones(())
         self.constant = like.new_tensor(-0.5 * K * math.log(2 * math.pi))
         self._noise: tuple[Tensor, Tensor] | None = None
@@ -73,7 +82,8 @@ class Plan:
             weights = span.seen(part).view(*batch, last - first, -1, E)
             buffer = terms[: weights.numel()].view(weights.shape)
             family = families.index(basis.bases[rows[first]])
-            self._ranges.append(_Range(family, weights, buffer, self.projections[..., first:last, :]))
+            middle = centre[..., part].reshape(*batch, last - first, -1)
+            self._ranges.append(_Range(family, weights, middle, buffer, self.projections[..., first:last, :]))
 
     def project(self, phase: Tensor) -> Tensor:
         """h(x) [..., K, E] of members at phases [..., E]: the plan's buffer, overwritten next time."""
@@ -81,13 +91,13 @@ class Plan:
         low, high = torch.aminmax(phase)
         inside = float(low) >= 0 and float(high) <= 1
         features: dict[int, Tensor] = {}
-        for family, weights, terms, projections in self._ranges:
+        for family, weights, centre, terms, projections in self._ranges:
             if family not in features:
                 functions = self._families[family]
-                found = functions.by_function(phase) if inside else functions(phase).transpose(-1, -2)
-                features[family] = found.unsqueeze(-3)
-            torch.mul(weights, features[family], out=terms)
+                features[family] = functions.by_function(phase) if inside else functions(phase).transpose(-1, -2)
+            torch.mul(weights, features[family].unsqueeze(-3), out=terms)
             torch.sum(terms, -2, out=projections)
+            self._add_product(projections, centre, features[family])
         return self.projections
 
     def measurement_noise(self, deviations: Callable[[], tuple[Tensor, bool]]) -> tuple[Tensor, Tensor]:
