@@ -7,6 +7,10 @@ import os
 from pathlib import Path
 
 import pytest
+
+# One thread a process, here and in what is started from here: as many tests run side by side as there are cores, and
+# threads that wait for each other take ten times as long.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 import torch
 from hypothesis import settings
 
@@ -17,7 +21,28 @@ torch.set_num_threads(1)
 settings.register_profile("fixed", derandomize=True, deadline=None)
 settings.register_profile("random", deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))
+LONG = (
+    "test_ranks.py",
+    "test_tune.py",
+    "test_soak.py",
+    "test_catch.py",
+    "test_rerun.py",
+    "test_full_disk.py",
+    "test_kill.py",
+    "test_compare.py",
+    "test_interrupts.py",
+    "test_faults.py",
+    "test_fuzz.py",
+    "test_tuning.py",
+    "test_session.py",
+)
+"""What takes longest, which is begun first: otherwise one core would work on it at the end, and the other wait."""
 SHARED = Path(__file__).parents[2] / "shared" / "data" / "handover.npz"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files that take long first; the others in their order."""
+    items.sort(key=lambda item: next((i for i, name in enumerate(LONG) if name in item.nodeid), len(LONG)))
 
 
 def layout() -> Layout:

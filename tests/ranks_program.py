@@ -14,7 +14,7 @@ from tests.test_tuning import filter_and_tuner
 from torch_ebip.ranks import RankLostError, Ranks
 from torch_ebip.tuning import TuningSettings
 
-SETTINGS = TuningSettings(steps=8, batch_size=6, validate_every=2, folds=4, thinning=2, seed=3)
+SETTINGS = TuningSettings(steps=4, batch_size=6, validate_every=2, folds=4, thinning=4, seed=3)
 
 
 def main(folder: Path, killed_at: int | None) -> None:

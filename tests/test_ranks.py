@@ -45,28 +45,39 @@ def assert_same(a: dict, b: dict) -> None:
         )
 
 
-def test_the_result_does_not_depend_on_the_number_of_processes(tmp_path: Path) -> None:
-    for count in (1, 2, 3):
-        done = launch(count, tmp_path / str(count))
-        assert done.returncode == 0, done.stderr
-    for count in (2, 3):
-        assert_same(outcome(tmp_path / "1"), outcome(tmp_path / str(count)))
-        assert outcome(tmp_path / str(count))["words"] == "from the first"
-        assert outcome(tmp_path / str(count))["ranks"] == list(range(count))
-        # Processes of one machine listen for each other on it only; torchrun itself does not keep to that.
-        assert outcome(tmp_path / str(count))["listening"] == [["127.0.0.1"]] * count
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> dict:
+    """What one process comes to."""
+    folder = tmp_path_factory.mktemp("ranks") / "1"
+    done = launch(1, folder)
+    assert done.returncode == 0, done.stderr
+    return outcome(folder)
 
 
-def test_a_killed_process_ends_the_run_which_resumes_with_another_number(tmp_path: Path) -> None:
-    assert launch(1, tmp_path / "whole").returncode == 0
-    killed = launch(2, tmp_path / "killed", "5")
+def assert_talked(outcome: dict, count: int) -> None:
+    """That many processes did, on this machine only; torchrun itself does not keep to that."""
+    assert outcome["words"] == "from the first"
+    assert outcome["ranks"] == list(range(count))
+    assert outcome["listening"] == [["127.0.0.1"]] * count
+
+
+def test_the_result_does_not_depend_on_the_number_of_processes(alone: dict, tmp_path: Path) -> None:
+    done = launch(2, tmp_path / "2")
+    assert done.returncode == 0, done.stderr
+    assert_same(alone, outcome(tmp_path / "2"))
+    assert_talked(outcome(tmp_path / "2"), 2)
+
+
+def test_a_killed_process_ends_the_run_which_resumes_with_another_number(alone: dict, tmp_path: Path) -> None:
+    killed = launch(2, tmp_path / "killed", "3")
     assert killed.returncode != 0
     assert "run it again to go on" in killed.stderr
     assert (tmp_path / "killed" / "c.pt").exists()
     assert not (tmp_path / "killed" / "outcome.json").exists()
     resumed = launch(3, tmp_path / "killed")
     assert resumed.returncode == 0, resumed.stderr
-    assert_same(outcome(tmp_path / "whole"), outcome(tmp_path / "killed"))
+    assert_same(alone, outcome(tmp_path / "killed"))
+    assert_talked(outcome(tmp_path / "killed"), 3)
 
 
 def test_one_process_needs_no_group() -> None:

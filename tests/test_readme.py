@@ -91,7 +91,7 @@ def test_the_other_studies_have_what_is_said_of_all_of_them(capsys: pytest.Captu
 def test_the_files_it_points_to_are_there() -> None:
     links = re.findall(r"\]\(([^)#:]+)\)", README)
     paths = re.findall(r"`((?:experiments|tests|docs)/[\w/.]+)`", README)
-    architecture = README.split("## Architecture")[1].split("\nShapes:")[0]
+    architecture = (ROOT / "docs" / "architecture.md").read_text().split("\nShapes:")[0]
     files = [name for row in architecture.splitlines() if row.startswith("| `") for name in _first_cell(row)]
     missing = [
         path for path in [*links, *paths, *(f"torch_ebip/{name}" for name in files)] if not (ROOT / path).exists()
@@ -101,7 +101,7 @@ def test_the_files_it_points_to_are_there() -> None:
 
 
 def test_the_architecture_names_every_file() -> None:
-    architecture = README.split("## Architecture")[1].split("\nShapes:")[0]
+    architecture = (ROOT / "docs" / "architecture.md").read_text().split("\nShapes:")[0]
     named = {name.rstrip("/") for row in architecture.splitlines() for name in _first_cell(row)}
     found = {path.name for path in (ROOT / "torch_ebip").iterdir() if path.suffix == ".py" or path.is_dir()}
     assert found - {"__init__.py", "__pycache__"} == named

@@ -1,15 +1,30 @@
 """Tuning: honest ensembles, gradients that help, runs that resume to the same numbers."""
 
+import math
+import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from tests.conftest import interactions, small_primitive
-from torch_ebip import BSplineBasis, EnsembleFilter, ebip
+from torch_ebip import (
+    BSplineBasis,
+    Demonstrations,
+    EnsembleFilter,
+    InteractionPrimitive,
+    Layout,
+    Modality,
+    PolynomialBasis,
+    StackedBasis,
+    ebip,
+)
 from torch_ebip.checkpoint import load_checkpoint, save_checkpoint
 from torch_ebip.kinematics import RobotArm
 from torch_ebip.losses import ForwardKinematicsLoss
+from torch_ebip.monitor import Monitor
 from torch_ebip.noise import AboveOne
 from torch_ebip.objective import ForecastObjective, Weights
 from torch_ebip.ranks import Ranks
@@ -291,3 +306,103 @@ def test_a_checkpoint_of_another_format(tmp_path: Path) -> None:
     torch.save({"format": 0, "configuration": {}, "content": {}}, path)
     with pytest.raises(ValueError, match="checkpoint format 0, this version reads 1"):
         load_checkpoint(path, {})
+
+
+def test_a_resumed_run_shows_every_step_once(tmp_path: Path) -> None:
+    """Whenever it was interrupted: before its first checkpoint, at one, or after."""
+
+    class StoppedError(Exception):
+        """Not an error: the test's way to interrupt."""
+
+    settings = TuningSettings(steps=7, batch_size=2, validate_every=3, folds=3, thinning=2)
+
+    def run(folder: Path, last: int | None) -> None:
+        def progress(step: int, *_: float) -> None:
+            if step == last:
+                raise StoppedError
+
+        with Monitor(folder / "tb") as monitor:
+            _, tuner = filter_and_tuner(settings, checkpoint=folder / "c.pt", progress=progress, monitor=monitor)
+            tuner.run()
+
+    for last in (2, 3, 5):
+        folder = tmp_path / str(last)
+        with pytest.raises(StoppedError):
+            run(folder, last)
+        time.sleep(1.05)  # TensorBoard orders files by the second in their names
+        run(folder, None)
+        events = EventAccumulator(str(folder / "tb"))
+        events.Reload()
+        assert [event.step for event in events.Scalars("train/loss")] == [1, 2, 3, 4, 5, 6, 7]
+        assert [event.step for event in events.Scalars("validation/loss")] == [0, 3, 6, 7]
+
+
+def arm_primitive(
+    names: Sequence[str], unit: str = "rad", factor: float = 1.0
+) -> tuple[InteractionPrimitive, Layout]:
+    """Of a hand and the UR5's joints in some order and unit."""
+    generator = torch.Generator().manual_seed(0)
+    layout = Layout([Modality("hand", ["x"], "m"), Modality("robot", names, unit, controlled=True)])
+    joints = RobotArm.ur5().joint_names
+    paths = []
+    for _ in range(8):
+        a, p = torch.randn(7, generator=generator), torch.linspace(0, 1, 30)[:, None]
+        values = factor * a[1:] * p
+        columns = [values[:, joints.index(name) if name in joints else i] for i, name in enumerate(names)]
+        paths.append(torch.stack([a[0] * p[:, 0], *columns], -1))
+    demonstrations = Demonstrations(layout, paths, 30.0)
+    return InteractionPrimitive.fit(demonstrations, StackedBasis([PolynomialBasis(3)] * (1 + len(names)))), layout
+
+
+def tool_term(names: Sequence[str], unit: str = "rad", factor: float = 1.0) -> float:
+    primitive, layout = arm_primitive(names, unit, factor)
+    made = ebip(primitive, square_root=True)
+    objective = ForecastObjective(
+        primitive,
+        layout.controlled,
+        weights=Weights(0.0, 0.0, 1.0, 0.0),
+        arm=ForwardKinematicsLoss(RobotArm.ur5()),
+        arm_dofs=layout.controlled,
+    )
+    now = torch.tensor([[0.5]])
+    y = torch.full((1, 16, 7), torch.nan)
+    y[0, :, 0] = 0.3 * torch.linspace(0, 0.5, 16)
+    trace = made(y, keep=torch.tensor([[15]]), generator=torch.Generator().manual_seed(0))
+    ends = primitive.basis.project(objective.phases_ahead(now), primitive.weights[0][None, None, None])
+    terms = objective(made, trace, ~y.isnan(), ends[..., layout.controlled], now, layout.controlled)
+    return float(terms["tool"].detach())
+
+
+def test_joints_are_taken_by_their_names() -> None:
+    """In whatever order a driver publishes them; by place where they have names of their own."""
+    joints = list(RobotArm.ur5().joint_names)
+    right = tool_term(joints)
+    assert right > 0.01
+    assert tool_term([joints[i] for i in (2, 1, 0, 3, 4, 5)]) == pytest.approx(right, rel=1e-3)
+    assert tool_term([f"robot.{i}" for i in range(6)]) == pytest.approx(right, rel=1e-3)
+    with pytest.raises(ValueError, match=r"joint 'shoulder_pan_joint' is in 'rad', but .* in 'deg'"):
+        tool_term(joints, "deg", 180 / math.pi)
+    with pytest.raises(ValueError, match=r"named after the arm's joints .* elbow are not"):
+        tool_term([*joints[:2], "elbow", *joints[3:]])
+    primitive, layout = arm_primitive(joints[:5])
+    loss = ForwardKinematicsLoss(RobotArm.ur5())
+    with pytest.raises(ValueError, match="the arm has 6 joints"):
+        ForecastObjective(primitive, layout.controlled, arm=loss, arm_dofs=layout.controlled)
+    with pytest.raises(ValueError, match=r"the arm's joints must be targets, which shoulder_pan_joint"):
+        ForecastObjective(primitive, layout.mask(["x"]), arm=loss, arm_dofs=layout.controlled)
+
+
+def test_what_a_tuner_is_given_must_belong_together() -> None:
+    made, primitive = interactions(), small_primitive()
+    hand, *rest = made.layout.modalities
+    swapped = Layout([Modality("hand", hand.dofs[::-1], "m"), *rest])
+    objective = ForecastObjective(primitive, TARGETS)
+    for demonstrations, filter, targets, subsets, message in (
+        (Demonstrations(swapped, list(made), 30.0), ebip(primitive), TARGETS, SUBSETS, "another layout or rate"),
+        (Demonstrations(made.layout, list(made), 60.0), ebip(primitive), TARGETS, SUBSETS, "another layout or rate"),
+        (made, ebip(primitive), ~TARGETS, SUBSETS, "which are not the targets"),
+        (made, ebip(primitive), TARGETS, {}, "at least one set of sensors"),
+        (made, ebip(primitive), TARGETS, {"a": torch.tensor([0, 1])}, r"subset 'a' must be bool \[5\]"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Tuner(filter, demonstrations, primitive, objective, targets, subsets, SMALL)

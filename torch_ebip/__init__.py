@@ -59,3 +59,15 @@ __all__ = [
     "particle_filter",
     "select_basis",
 ]
+
+
+def __getattr__(name: str) -> str:
+    """``__version__``: looked up when somebody asks, which takes as long as importing all the rest."""
+    if name != "__version__":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("torch-ebip")
+    except PackageNotFoundError:  # run from a checkout that nobody installed
+        return "unknown"

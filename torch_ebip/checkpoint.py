@@ -20,6 +20,9 @@ LIMIT = 1 << 32
 CODE_LIMIT = 1 << 22
 """Bytes of a checkpoint beside its tensors."""
 _MADE = re.compile(r"collections OrderedDict|torch (Size|\w+Storage)|torch\._utils _rebuild_(tensor_v2|parameter)")
+_MEMBER = re.compile(
+    r"[^/]+/(data\.pkl|byteorder|version|data/\d+|\.data/serialization_id|\.format_version|\.storage_alignment)"
+)
 _PLAIN = (bool, int, float, str, type(None))
 
 
@@ -62,6 +65,7 @@ def load_checkpoint(
             file.seek(0)
             stored = torch.load(file, map_location="cpu", weights_only=True)
         version, theirs, content = stored["format"], stored["configuration"], stored["content"]
+        _check_tensors(stored)
         if not isinstance(theirs, dict) or not isinstance(content, dict):
             raise ValueError("no configuration or content in it")
         if not all(isinstance(name, str) for name in theirs):
@@ -69,8 +73,9 @@ def load_checkpoint(
     except FileNotFoundError:
         raise
     except Exception as error:  # damaged bytes raise nearly anything, a lack of memory included
-        # Without torch's advice to load it unsafely.
         reason = str(error).rpartition("WeightsUnpickler error:")[2].strip()[:300]
+        if "weights_only" in reason or not reason:  # torch's advice to load it unsafely
+            reason = "it holds something else than tensors, numbers, strings and containers of them"
         raise ValueError(
             f"{path}: not a readable checkpoint (cut off, damaged or of another kind): {reason}"
         ) from error
@@ -83,7 +88,15 @@ def load_checkpoint(
 
 
 def _check_code(archive: zipfile.ZipFile) -> None:
-    """Nothing but tensors, numbers, strings and containers: torch also makes bytes of any length, as a file asks."""
+    """Nothing but tensors, numbers, strings and containers: torch also makes bytes of any length, as a file asks.
+
+    Torch looks members up without regard to case, so that there must be no two ways to spell one.
+    """
+    names = [member.filename for member in archive.infolist()]
+    if len({name.lower() for name in names}) != len(names):
+        raise ValueError("members of it have names that differ by case only")
+    if len({name.partition("/")[0] for name in names}) != 1 or not all(map(_MEMBER.fullmatch, names)):
+        raise ValueError("members that no checkpoint has")
     for member in archive.infolist():
         if member.filename.endswith("/data.pkl"):
             if member.file_size > CODE_LIMIT:
@@ -91,6 +104,25 @@ def _check_code(archive: zipfile.ZipFile) -> None:
             for opcode, argument, _ in pickletools.genops(archive.read(member)):
                 if opcode.name == "GLOBAL" and not _MADE.fullmatch(str(argument)):
                     raise ValueError(f"{str(argument)[:80]!r} in it is none of tensors, numbers, strings, containers")
+
+
+def _check_tensors(content: Any) -> None:
+    """No tensor that is larger than what the file holds for it: strides of 0 make gigabytes of a few bytes.
+
+    Raises:
+        ValueError: there is one.
+    """
+    # Each container once: they may hold each other, and themselves.
+    seen: set[int] = set()
+    open_ones = [content]
+    while open_ones:
+        part = open_ones.pop()
+        if isinstance(part, torch.Tensor):
+            if part.numel() * part.element_size() > part.untyped_storage().nbytes():
+                raise ValueError(f"a tensor {list(part.shape)[:8]} of {part.untyped_storage().nbytes()} bytes")
+        elif isinstance(part, Mapping | list | tuple) and id(part) not in seen:
+            seen.add(id(part))
+            open_ones += part.values() if isinstance(part, Mapping) else part
 
 
 def _differences(theirs: Mapping[Any, Any], ours: Mapping[str, Any], prefix: str = "") -> Iterator[str]:

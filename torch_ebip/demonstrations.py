@@ -10,7 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_ebip.folders import read_folder
+from torch_ebip.ambient import outside_inference, own_modes
+from torch_ebip.arguments import as_count, as_indices, as_number, as_values
+from torch_ebip.folders import CSV_LIMIT, read_folder
 from torch_ebip.layout import Layout
 from torch_ebip.recordings import LIMIT, Array, Recordings, read_npz, write_npz
 
@@ -20,7 +22,9 @@ class Demonstrations:
 
     Args:
         layout: what the D columns are.
-        trajectories: N tensors [T_i, D] in the units of the layout, sampled evenly; NaN = not measured.
+        trajectories: N tensors [T_i, D] in the units of the layout, sampled evenly; NaN = not measured. Arrays, lists
+            and data frames (whose columns are taken by the layout's names) are taken as well. They are data: a graph
+            that they carry is left behind.
         rate: samples a second, Hz.
         columns: further facts, one row a demonstration (release times, names), kept under their names.
 
@@ -36,12 +40,11 @@ class Demonstrations:
         rate: float,
         columns: Mapping[str, Array] | None = None,
     ) -> None:
-        if not (math.isfinite(rate) and rate > 0):
-            raise ValueError(f"rate must be a positive number of samples a second, got {rate}")
+        rate = as_number("rate", rate, 0, above=True, of="of samples a second")
         if len(trajectories) == 0:
             raise ValueError("at least one demonstration is needed, got none")
         self.layout = layout
-        self.rate = float(rate)
+        self.rate = rate
         self.trajectories = tuple(_checked(i, trajectory, layout) for i, trajectory in enumerate(trajectories))
         if len({(trajectory.dtype, trajectory.device) for trajectory in self.trajectories}) > 1:
             raise ValueError("all trajectories must have one dtype and live on one device")
@@ -71,7 +74,7 @@ class Demonstrations:
     @property
     def lengths(self) -> Tensor:
         """int64 [N]: T_i, the number of samples of each."""
-        return torch.tensor([len(trajectory) for trajectory in self.trajectories])
+        return torch.tensor([len(trajectory) for trajectory in self.trajectories], device="cpu")
 
     @property
     def durations(self) -> Tensor:
@@ -79,12 +82,16 @@ class Demonstrations:
         dtype = self.trajectories[0].dtype
         return (self.lengths.to(dtype) - 1) / self.rate
 
-    def subset(self, indices: Sequence[int] | Tensor) -> Demonstrations:
-        """The demonstrations at these indices [M], with their columns; ValueError if an index is out of range."""
-        chosen = [int(i) for i in indices]
-        outside = [i for i in chosen if not -len(self) <= i < len(self)]
-        if outside:
-            raise ValueError(f"no demonstration {outside}; there are {len(self)}")
+    def subset(self, indices: Sequence[int] | Sequence[bool] | Tensor) -> Demonstrations:
+        """Some of the demonstrations, with their columns.
+
+        Args:
+            indices: [M], which ones, negative ones from the end; or a mask, bool [N].
+
+        Raises:
+            ValueError: an index out of range, a mask of another length, fractions; none chosen.
+        """
+        chosen = as_indices("demonstration", indices, len(self)).tolist()
         columns = {name: column[chosen] for name, column in self.columns.items()}
         return Demonstrations(self.layout, [self.trajectories[i] for i in chosen], self.rate, columns)
 
@@ -98,9 +105,9 @@ class Demonstrations:
         Raises:
             ValueError: k is not between 2 and the number of demonstrations.
         """
-        if not 2 <= k <= len(self):
+        if not 2 <= as_count("folds", k) <= len(self):
             raise ValueError(f"folds must be between 2 and the {len(self)} demonstrations there are, got {k}")
-        parts = torch.randperm(len(self), generator=generator).tensor_split(k)
+        parts = torch.randperm(len(self), generator=generator, device="cpu").tensor_split(k)
         return [(torch.cat([*parts[:i], *parts[i + 1 :]]), parts[i]) for i in range(k)]
 
     def pad(self) -> tuple[Tensor, Tensor]:
@@ -114,10 +121,10 @@ class Demonstrations:
         return Demonstrations(self.layout, moved, self.rate, self.columns)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write one ``.npz`` (values in float32, never pickled); atomic.
+        """Write one ``.npz`` (values in float32, never pickled), which `load` reads; atomic.
 
         Raises:
-            ValueError: a column that holds Python objects, or that has the name of a part of the format.
+            ValueError: see `recordings.write_npz`.
         """
         arrays = [trajectory.detach().cpu().numpy() for trajectory in self.trajectories]
         write_npz(path, Recordings(self.layout, arrays, self.rate, self.columns))
@@ -131,7 +138,7 @@ class Demonstrations:
         return cls._from_recordings(path, read_npz(path, limit))
 
     @classmethod
-    def load_folder(cls, path: str | os.PathLike[str], limit: int = LIMIT) -> Demonstrations:
+    def load_folder(cls, path: str | os.PathLike[str], limit: int = CSV_LIMIT) -> Demonstrations:
         """Read a folder of CSV files beside a ``layout.toml`` or ``layout.json``: see `folders.read_folder`."""
         return cls._from_recordings(path, read_folder(path, limit))
 
@@ -146,13 +153,13 @@ class Demonstrations:
 
 def _checked(index: int, trajectory: Tensor, layout: Layout) -> Tensor:
     name = f"demonstration {index}"
+    with own_modes(inference=True):
+        trajectory = outside_inference(as_values(name, trajectory, layout.dofs).detach())
     if trajectory.ndim != 2 or trajectory.shape[1] != layout.n_dofs:
         raise ValueError(
             f"{name} has shape {tuple(trajectory.shape)}, expected [T, {layout.n_dofs}]: one column for each of "
             f"{', '.join(layout.names)}"
         )
-    if not trajectory.is_floating_point():
-        raise ValueError(f"{name} must hold floating-point numbers, got {trajectory.dtype}")
     if len(trajectory) < 2:
         raise ValueError(f"{name} has {len(trajectory)} samples, at least 2 are needed")
     if trajectory.isnan().all():

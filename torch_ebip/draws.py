@@ -63,7 +63,7 @@ def seeded(*numbers: int) -> torch.Generator:
     for number in (*numbers, 0):  # once more, so that the last number is mixed like the others
         # The multiplier of Knuth's 64-bit linear congruential generator.
         seed = (seed * 6_364_136_223_846_793_005 + 1_442_695_040_888_963_407 + number) % 2**64
-    return torch.Generator().manual_seed(seed >> 32)  # the better half; torch's generator takes no more
+    return torch.Generator("cpu").manual_seed(seed >> 32)  # the better half; torch's generator takes no more
 
 
 def replayed(generator: Generators, states: Sequence[Tensor] | None = None) -> Generators:

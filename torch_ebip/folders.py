@@ -17,7 +17,7 @@ import numpy as np
 
 from torch_ebip.files import open_file, read_text
 from torch_ebip.layout import Layout, Modality
-from torch_ebip.recordings import LIMIT, MOST, Array, Recordings
+from torch_ebip.recordings import MOST, Array, Recordings
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -26,13 +26,15 @@ else:  # pragma: no cover
 
 DESCRIPTION_LIMIT = 1 << 20
 """Bytes of a description."""
+CSV_LIMIT = 1 << 27
+"""Bytes of all CSV files together, unless a caller says something else: some twenty seconds of reading."""
 LONGEST_ROW = 1 << 24
 """Characters of a row: a million columns."""
 # Time and memory of Python's reader grow with the square of the parts of a dotted key.
 _DOTTED = re.compile(r"""(?:\.[ \t]*(?:[\w-]+|"(?:[^"\\\n]|\\.)*"|'[^'\n]*')[ \t]*){16}""")
 
 
-def read_folder(path: str | os.PathLike[str], limit: int = LIMIT) -> Recordings:
+def read_folder(path: str | os.PathLike[str], limit: int = CSV_LIMIT) -> Recordings:
     """Read a folder of CSV files, one a demonstration, described by ``layout.toml`` or ``layout.json``.
 
     The description gives ``rate`` (Hz) and a list ``modalities`` of tables with ``name``, ``dofs``, ``unit``
@@ -57,8 +59,13 @@ def read_folder(path: str | os.PathLike[str], limit: int = LIMIT) -> Recordings:
         raise ValueError(f"{folder}: {len(files)} .csv files, expected at most {MOST}")
     trajectories = []
     for file in files:
-        with open_file(file, limit) as stream:
+        with open_file(file, None) as stream:
             limit -= stream.seek(0, os.SEEK_END)
+            if limit < 0:
+                size = stream.seek(0, os.SEEK_END)
+                raise ValueError(
+                    f"{file}: {size} bytes, expected at most {limit + size} more in this folder (see `limit`)"
+                )
             stream.seek(0)
             trajectories.append(_read_csv(file, stream, layout))
     return Recordings(layout, trajectories, rate, {"demo_id": np.array([file.stem for file in files])})
@@ -116,7 +123,7 @@ def _read_csv(file: Path, stream: IO[bytes], layout: Layout) -> Array:
             lines.taken = 0
     except (ValueError, OSError, csv.Error) as error:
         raise ValueError(f"{file}:{rows.line_num}: {error}") from error
-    return np.array(samples, dtype=np.float32).reshape(-1, len(dofs))
+    return np.frombuffer(samples, dtype=np.float32).reshape(-1, len(dofs))
 
 
 class _Lines:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -21,7 +22,8 @@ class Modality:
         controlled: whether the robot moves these DoFs (the paper's D_c) or they are only observed (D_o).
 
     Raises:
-        ValueError: an empty name or unit, no DoFs, or a DoF named twice.
+        ValueError: an empty name or unit, no DoFs, or a DoF named twice; names that are no text or hold control
+            characters; a ``controlled`` that is no boolean.
     """
 
     name: str
@@ -34,13 +36,20 @@ class Modality:
             raise ValueError(f"modality {name!r}: dofs must be a sequence of names, got the string {dofs!r}")
         if not name or not unit:
             raise ValueError(f"a modality needs a name and a unit, got name={name!r}, unit={unit!r}")
-        names = tuple(str(dof) for dof in dofs)
+        names = tuple(dofs)
+        for text in (name, unit, *names):
+            if not isinstance(text, str):
+                raise ValueError(f"modality {name!r}: names and units must be text, got {text!r}")
+            if not text.isprintable():  # escapes would reach terminals and pictures, NUL ends names in files
+                raise ValueError(f"modality {name!r}: names and units must be printable, got {text[:80]!r}")
+        if controlled not in (True, False):
+            raise ValueError(f"modality {name!r}: controlled must be True or False, got {controlled!r}")
         if not names or not all(names):
             raise ValueError(f"modality {name!r} needs at least one DoF, each with a name, got {names!r}")
         _reject_repeats(f"modality {name!r}: DoF", names)
-        object.__setattr__(self, "name", str(name))
+        object.__setattr__(self, "name", name)
         object.__setattr__(self, "dofs", names)
-        object.__setattr__(self, "unit", str(unit))
+        object.__setattr__(self, "unit", unit)
         object.__setattr__(self, "controlled", bool(controlled))
 
 
@@ -56,28 +65,40 @@ class Layout:
     """
 
     modalities: tuple[Modality, ...]
+    _names: tuple[str, ...] = field(init=False, repr=False, compare=False)
+    _dofs: tuple[str, ...] = field(init=False, repr=False, compare=False)
+    _slices: dict[str, slice] = field(init=False, repr=False, compare=False)
 
     def __init__(self, modalities: Sequence[Modality]) -> None:
         object.__setattr__(self, "modalities", tuple(modalities))
         if not self.modalities:
             raise ValueError("a layout needs at least one modality")
+        for modality in self.modalities:
+            if not isinstance(modality, Modality):
+                raise ValueError(f"a layout consists of modalities, got {modality!r}")
+        # Asked for again and again, once a demonstration or a modality: found once.
+        object.__setattr__(self, "_names", tuple(modality.name for modality in self.modalities))
+        object.__setattr__(self, "_dofs", tuple(dof for modality in self.modalities for dof in modality.dofs))
         _reject_repeats("modality", self.names)
         _reject_repeats("DoF", self.dofs)
+        ends = accumulate(len(modality.dofs) for modality in self.modalities)
+        slices = {m.name: slice(end - len(m.dofs), end) for m, end in zip(self.modalities, ends, strict=True)}
+        object.__setattr__(self, "_slices", slices)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the modalities, in order."""
-        return tuple(modality.name for modality in self.modalities)
+        return self._names
 
     @property
     def dofs(self) -> tuple[str, ...]:
         """Names of all DoFs, in column order; D of them."""
-        return tuple(dof for modality in self.modalities for dof in modality.dofs)
+        return self._dofs
 
     @property
     def n_dofs(self) -> int:
         """D, the number of columns."""
-        return sum(len(modality.dofs) for modality in self.modalities)
+        return len(self.dofs)
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -87,12 +108,14 @@ class Layout:
     @property
     def controlled(self) -> Tensor:
         """bool [D]: whether the robot moves this DoF."""
-        return torch.tensor([modality.controlled for modality in self.modalities for _ in modality.dofs])
+        return torch.tensor(
+            [modality.controlled for modality in self.modalities for _ in modality.dofs], device="cpu"
+        )
 
     @property
     def modality_of_dof(self) -> Tensor:
         """int64 [D]: index into `modalities` of each DoF."""
-        return torch.tensor([i for i, modality in enumerate(self.modalities) for _ in modality.dofs])
+        return torch.tensor([i for i, modality in enumerate(self.modalities) for _ in modality.dofs], device="cpu")
 
     def __getitem__(self, name: str) -> Modality:
         """The modality of that name; ValueError if there is none."""
@@ -103,12 +126,9 @@ class Layout:
 
     def slice(self, name: str) -> slice:
         """The columns of a modality; ValueError if there is none of that name."""
-        start = 0
-        for modality in self.modalities:
-            if modality.name == name:
-                return slice(start, start + len(modality.dofs))
-            start += len(modality.dofs)
-        raise ValueError(f"no modality {name!r}; this layout has {', '.join(self.names)}")
+        if name not in self._slices:
+            raise ValueError(f"no modality {name!r}; this layout has {', '.join(self.names)}")
+        return self._slices[name]
 
     def mask(self, names: Iterable[str]) -> Tensor:
         """bool [D]: True in the columns of the named modalities or single DoFs.
@@ -117,9 +137,9 @@ class Layout:
             ValueError: a name that is neither a modality nor a DoF.
         """
         names = [names] if isinstance(names, str) else list(names)
-        selected = torch.zeros(self.n_dofs, dtype=torch.bool)
+        selected = torch.zeros(self.n_dofs, dtype=torch.bool, device="cpu")
         for name in names:
-            if name in self.names:
+            if name in self._slices:
                 selected[self.slice(name)] = True
             elif name in self.dofs:
                 selected[self.dofs.index(name)] = True

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from torch_ebip.ambient import owned, without_autocast
 from torch_ebip.kinematics import RobotArm
 from torch_ebip.scores import crps, energy_score
 
@@ -29,8 +30,8 @@ class TrajectoryLoss(nn.Module):
         dofs = torch.ones_like(scale, dtype=torch.bool) if dofs is None else dofs
         if scale.shape != dofs.shape or not bool((scale[dofs] > 0).all()) or not bool(dofs.any()):
             raise ValueError("scale must be [D] and positive for the chosen DoFs, of which there must be one")
-        self.register_buffer("scale", scale)
-        self.register_buffer("dofs", dofs)
+        self.register_buffer("scale", owned(scale))
+        self.register_buffer("dofs", owned(dofs))
 
     def forward(self, predicted: Tensor, target: Tensor) -> Tensor:
         """From predicted and target [..., D] (phases and batches in front), units of the DoFs: unitless scalar."""
@@ -122,6 +123,7 @@ class ForwardKinematicsLoss(nn.Module):
         return distance.mul(measured).sum() / measured.sum().clamp(min=1)
 
 
+@without_autocast
 def geodesic_angle(a: Tensor, b: Tensor) -> Tensor:
     """Angle in rad [...] of the rotation between rotation matrices a and b, [..., 3, 3]; gradient 0 at 0 and pi."""
     between = a.transpose(-1, -2) @ b

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -33,6 +34,7 @@ class Monitor:
         from torch.utils.tensorboard import SummaryWriter
 
         self.folder = str(folder)
+        self._goes_on = any(Path(folder).glob("events.out.tfevents.*"))
         self._writer: Any = SummaryWriter(self.folder)
 
     def __enter__(self) -> Monitor:
@@ -40,6 +42,19 @@ class Monitor:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def resume(self, step: int) -> None:
+        """Take back what an interrupted run wrote here after this step, since it will be written again."""
+        if not self._goes_on or self._writer is None:
+            return
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._send("close")
+        try:
+            self._writer = SummaryWriter(self.folder, purge_step=step + 1)
+        except OSError as error:
+            self._writer = None
+            warnings.warn(f"{self.folder}: what TensorBoard shows ends here: {error}", stacklevel=2)
 
     def scalars(self, values: Mapping[str, float], step: int) -> None:
         """One point at this step for each of some values; a slash in a name groups them."""

@@ -5,10 +5,15 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from torch_ebip.ambient import owned, without_autocast
+from torch_ebip.arguments import as_mask, as_number, as_values
 from torch_ebip.filters.base import Filter, Trace
+from torch_ebip.kinematics import RobotArm
+from torch_ebip.layout import Layout
 from torch_ebip.losses import ForwardKinematicsLoss, InnovationLikelihoodLoss, TrajectoryLoss
+from torch_ebip.meaning import Meaning
 from torch_ebip.primitive import InteractionPrimitive
 
 
@@ -29,7 +34,7 @@ class Weights(NamedTuple):
     innovation: float = 0.0
 
 
-class ForecastObjective(nn.Module):
+class ForecastObjective(Meaning):
     """Scores the forecasts that a filter makes of some DoFs, from states kept at several horizons.
 
     The target is an interaction's own regression, so it exists at every phase. Each DoF counts in units of its
@@ -41,10 +46,12 @@ class ForecastObjective(nn.Module):
         phases: [P], where between now (0) and the end (1) the forecast is scored.
         weights: of the terms.
         arm: for the term ``tool``: a loss on its joints.
-        arm_dofs: bool [D], the joints of the arm, all of them targets.
+        arm_dofs: bool [D], the joints of the arm, all of them targets. Where they have the names of the arm's joints
+            they are taken by name, in whatever order the columns are; otherwise in order.
 
     Raises:
-        ValueError: no target, a target that never varies, or a tool term without an arm.
+        ValueError: no target, a target that never varies, a negative weight, or a tool term without an arm; joints
+            that are no targets, are not as many as the arm's, have some of their names only, or another unit.
     """
 
     phases: Tensor
@@ -61,6 +68,9 @@ class ForecastObjective(nn.Module):
     ) -> None:
         super().__init__()
         self.weights = Weights() if weights is None else weights
+        for term, weight in self.weights._asdict().items():
+            as_number(f"the weight of {term}", weight, 0)
+        targets = as_mask("targets", targets, primitive.layout.n_dofs).to(primitive.weights.device)
         if self.weights.tool and (arm is None or arm_dofs is None):
             raise ValueError("the tool term needs an arm and the DoFs that are its joints")
         ends = primitive.end_variance
@@ -69,14 +79,28 @@ class ForecastObjective(nn.Module):
             names = [dof for dof, still in zip(primitive.layout.dofs, fixed.tolist(), strict=True) if still]
             raise ValueError(f"targets must be DoFs that end differently in different demonstrations, got {names}")
         scale = ends.sqrt()[targets]
-        self.register_buffer("scale", scale)
+        self.register_buffer("scale", owned(scale))
         self.squared_error = TrajectoryLoss(scale)
         self.innovation = InnovationLikelihoodLoss()
         self.arm = arm
-        self.arm_dofs = None if arm_dofs is None else arm_dofs[targets]
-        phases = scale.new_tensor([0.5, 1.0]) if phases is None else phases.to(scale)
-        self.register_buffer("phases", phases)
+        self.names = [dof for dof, ours in zip(primitive.layout.dofs, targets.tolist(), strict=True) if ours]
+        self.joints = None
+        if arm is not None and arm_dofs is not None:
+            self.joints = _joints(arm.arm, primitive.layout, as_mask("arm_dofs", arm_dofs, len(targets)), self.names)
+        phases = scale.new_tensor([0.5, 1.0]) if phases is None else as_values("phases", phases, None, scale)
+        if phases.ndim != 1 or not bool(((phases >= 0) & (phases <= 1)).all()):
+            raise ValueError(f"phases must be [P], from 0 (now) to 1 (the end), got {phases}")
+        self.register_buffer("phases", owned(phases))
 
+    def extra_repr(self) -> str:
+        """What is scored, and how much each term counts."""
+        return f"targets={', '.join(self.names)}, {self.weights}"
+
+    def meant(self) -> str:
+        """What its tensors mean, see `Meaning`."""
+        return f"targets={', '.join(self.names)}"
+
+    @without_autocast
     def forward(
         self, filter: Filter, trace: Trace, observed: Tensor, truth: Tensor, now: Tensor, targets: Tensor
     ) -> dict[str, Tensor]:
@@ -101,8 +125,8 @@ class ForecastObjective(nn.Module):
             terms["crps"] = self.weights.crps * (forecast.crps(truth) / self.scale).mean()
         if self.weights.squared_error:
             terms["squared_error"] = self.weights.squared_error * self.squared_error(forecast.mean, truth)
-        if self.weights.tool and self.arm is not None:
-            joints, wanted = forecast.mean[..., -1, self.arm_dofs], truth[..., -1, self.arm_dofs]
+        if self.weights.tool and self.arm is not None and self.joints is not None:
+            joints, wanted = forecast.mean[..., -1, self.joints], truth[..., -1, self.joints]
             terms["tool"] = self.weights.tool * self.arm(joints, wanted)
         if self.weights.innovation:
             terms["innovation"] = self.weights.innovation * self.innovation(trace.log_likelihood, observed)
@@ -112,6 +136,7 @@ class ForecastObjective(nn.Module):
         """Phases [..., P] that are scored from the phases now [...] of the horizons."""
         return now.unsqueeze(-1) + (1 - now.unsqueeze(-1)) * self.phases
 
+    @without_autocast
     def spread_and_error(self, filter: Filter, trace: Trace, truth: Tensor, targets: Tensor) -> Tensor:
         """[2]: root mean variance of the forecasts of phase 1 and root mean squared error of their mean.
 
@@ -133,3 +158,26 @@ class ForecastObjective(nn.Module):
         error = (forecast.mean[..., 0, :] - truth[..., -1, :]) / self.scale
         variance = forecast.variance / self.scale.square()
         return torch.stack([variance.mean().sqrt(), error.square().mean().sqrt()])
+
+
+def _joints(arm: RobotArm, layout: Layout, dofs: Tensor, targets: list[str]) -> list[int]:
+    """Which of the targets is each of an arm's joints, in the arm's order; see `ForecastObjective`."""
+    names = [dof for dof, ours in zip(layout.dofs, dofs.tolist(), strict=True) if ours]
+    strangers = [name for name in names if name not in targets]
+    if strangers:
+        raise ValueError(f"the arm's joints must be targets, which {', '.join(strangers)} are not")
+    if len(names) != arm.n_joints:
+        raise ValueError(f"the arm has {arm.n_joints} joints ({', '.join(arm.joint_names)}), got {', '.join(names)}")
+    if set(names) & set(arm.joint_names):
+        unknown = [name for name in names if name not in arm.joint_names]
+        if unknown:
+            raise ValueError(
+                f"some DoFs are named after the arm's joints ({', '.join(arm.joint_names)}), "
+                f"{', '.join(unknown)} are not"
+            )
+        names = list(arm.joint_names)
+    for joint, name, unit in zip(arm.joint_names, names, arm.joint_units, strict=True):
+        theirs = layout.units[layout.dofs.index(name)]
+        if theirs != unit:
+            raise ValueError(f"the arm's joint {joint!r} is in {unit!r}, but {name!r} of the layout in {theirs!r}")
+    return [targets.index(name) for name in names]

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from torch_ebip.ambient import in_own_modes, owned
+from torch_ebip.arguments import as_indices
 from torch_ebip.basis.regression import (
     Samples,
     correlation_time,
@@ -19,9 +21,11 @@ from torch_ebip.basis.selection import select_basis
 from torch_ebip.basis.stacked import StackedBasis
 from torch_ebip.demonstrations import Demonstrations
 from torch_ebip.layout import Layout
+from torch_ebip.meaning import Meaning
+from torch_ebip.repeats import longest_repeats
 
 
-class InteractionPrimitive(nn.Module):
+class InteractionPrimitive(Meaning):
     """Weights, phase velocities and closed-form noise of N demonstrations; made by `fit`.
 
     Attributes:
@@ -34,6 +38,7 @@ class InteractionPrimitive(nn.Module):
             one's mean squared residual, in squared units of the DoF.
         residual_correlation_time: [D], integrated autocorrelation time of those residuals, in samples.
         value_variance: [D], variance of each DoF over all measured samples, squared units; 0 for a constant.
+        longest_repeat: [M] seconds for which each modality says the same to the last digit; see `longest_repeats`.
         end_variance: [D], variance over demonstrations of h(1, w), squared units.
     """
 
@@ -42,6 +47,7 @@ class InteractionPrimitive(nn.Module):
     residual_variance: Tensor
     residual_correlation_time: Tensor
     value_variance: Tensor
+    longest_repeat: Tensor
 
     def __init__(
         self,
@@ -53,18 +59,22 @@ class InteractionPrimitive(nn.Module):
         residual_variance: Tensor,
         residual_correlation_time: Tensor,
         value_variance: Tensor,
+        longest_repeat: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.layout = layout
         self.basis = basis
         self.rate = rate
-        self.register_buffer("weights", weights)
-        self.register_buffer("phase_velocity", phase_velocity)
-        self.register_buffer("residual_variance", residual_variance)
-        self.register_buffer("residual_correlation_time", residual_correlation_time)
-        self.register_buffer("value_variance", value_variance)
+        self.register_buffer("weights", owned(weights))
+        self.register_buffer("phase_velocity", owned(phase_velocity))
+        self.register_buffer("residual_variance", owned(residual_variance))
+        self.register_buffer("residual_correlation_time", owned(residual_correlation_time))
+        self.register_buffer("value_variance", owned(value_variance))
+        repeat = weights.new_zeros(len(layout.names)) if longest_repeat is None else longest_repeat
+        self.register_buffer("longest_repeat", owned(repeat))
 
     @classmethod
+    @in_own_modes
     def fit(cls, demonstrations: Demonstrations, basis: StackedBasis | None = None) -> InteractionPrimitive:
         """Batched least squares (float64) of all demonstrations and DoFs, tolerant of missing samples.
 
@@ -82,6 +92,8 @@ class InteractionPrimitive(nn.Module):
         if len(demonstrations) < 2:
             raise ValueError("a primitive needs at least 2 demonstrations to have a spread, got 1")
         basis = select_basis(demonstrations) if basis is None else basis
+        if not isinstance(basis, StackedBasis):
+            raise ValueError(f"basis must be a StackedBasis, one basis for each DoF, got {type(basis).__name__}")
         layout = demonstrations.layout
         if basis.n_dofs != layout.n_dofs:
             raise ValueError(f"the basis is for {basis.n_dofs} DoFs, the demonstrations have {layout.n_dofs}")
@@ -113,8 +125,19 @@ class InteractionPrimitive(nn.Module):
         variance = torch.where(variance > 0, variance, 1e-12)
         dtype = demonstrations[0].dtype
         velocity = 1 / demonstrations.durations.to(weights)
-        tensors: Sequence[Tensor] = (weights, velocity, variance, correlation, spread)
+        repeats = longest_repeats(demonstrations).to(weights.device)
+        tensors: Sequence[Tensor] = (weights, velocity, variance, correlation, spread, repeats)
         return cls(layout, basis, demonstrations.rate, *(tensor.to(dtype) for tensor in tensors))
+
+    def extra_repr(self) -> str:
+        """Sizes, and what the columns are."""
+        return f"demonstrations={len(self)}, {self.meant()}"
+
+    def meant(self) -> str:
+        """What its tensors mean, see `Meaning`."""
+        dofs = zip(self.layout.dofs, self.layout.units, self.layout.controlled.tolist(), strict=True)
+        columns = (f"{dof} [{unit}]{' controlled' if controlled else ''}" for dof, unit, controlled in dofs)
+        return f"rate={self.rate:.9g}, dofs={', '.join(columns)}"
 
     def __len__(self) -> int:
         return len(self.weights)
@@ -135,8 +158,16 @@ class InteractionPrimitive(nn.Module):
         one = torch.ones(len(self), dtype=self.weights.dtype, device=self.weights.device)
         return self.basis.project(one, self.weights - self.weights.mean(0)).var(0)
 
-    def subset(self, indices: Tensor) -> InteractionPrimitive:
-        """The same basis and noise with some of the demonstrations, int64 [M]: they need no new regression."""
+    def subset(self, indices: Sequence[int] | Sequence[bool] | Tensor) -> InteractionPrimitive:
+        """The same basis and noise with some of the demonstrations: they need no new regression.
+
+        Args:
+            indices: [M], which ones, negative ones from the end; or a mask, bool [N].
+
+        Raises:
+            ValueError: an index out of range, a mask of another length, fractions.
+        """
+        indices = as_indices("demonstration", indices, len(self)).to(self.weights.device)
         return InteractionPrimitive(
             self.layout,
             self.basis,
@@ -146,4 +177,5 @@ class InteractionPrimitive(nn.Module):
             self.residual_variance,
             self.residual_correlation_time,
             self.value_variance,
+            self.longest_repeat,
         )

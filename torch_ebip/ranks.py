@@ -86,7 +86,7 @@ class Ranks:
         """
         if self.size == 1:
             return dict(values)
-        numbers = torch.tensor([*values.values(), 1.0], dtype=torch.float64) * weight
+        numbers = torch.tensor([*values.values(), 1.0], dtype=torch.float64, device="cpu") * weight
         self._sum(numbers)
         return dict(zip(values, (numbers[:-1] / numbers[-1]).tolist(), strict=True))
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import zipfile
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,8 +19,15 @@ from torch_ebip.layout import Layout, Modality
 
 Array = npt.NDArray[Any]
 _REQUIRED = ("values", "lengths", "rate", "dofs", "modality", "unit", "controlled")
-LIMIT = 1 << 30
-"""Bytes that a recording may have, unless a caller says something else."""
+LIMIT = 1 << 34
+"""Bytes that a recording may have, unless a caller says something else; no larger one is written."""
+DENSE = 1 << 28
+"""Bytes that any archive may unpack to, however small it is."""
+SHRUNK = 32
+"""How many times an archive may unpack to its own size beyond that: larger recordings that shrink more are stored as
+they are, so that a few kilobytes never ask for gigabytes."""
+LONGEST_NAME = 1000
+"""Characters of the name of a column."""
 MOST = 100_000
 """Demonstrations, and DoFs: each is an object of its own, which costs more than its bytes."""
 
@@ -35,7 +42,12 @@ class Recordings(NamedTuple):
 
 
 def write_npz(path: str | os.PathLike[str], recordings: Recordings) -> None:
-    """Write recordings to one compressed ``.npz`` at a path; atomic, never pickled."""
+    """Write recordings to one compressed ``.npz`` at a path, which `read_npz` reads; atomic, never pickled.
+
+    Raises:
+        ValueError: more than `LIMIT` or `MOST`; a column that holds Python objects, has the name of a part of the
+            format, or one that is not printable.
+    """
     layout = recordings.layout
     arrays: dict[str, Array] = {
         "values": np.concatenate(recordings.trajectories).astype(np.float32),
@@ -49,12 +61,33 @@ def write_npz(path: str | os.PathLike[str], recordings: Recordings) -> None:
     for name, column in recordings.columns.items():
         if name in arrays or name == "file":
             raise ValueError(f"column {name!r} has the name of a part of the format; rename it")
+        if not isinstance(name, str) or not name.isprintable() or not 0 < len(name) <= LONGEST_NAME:
+            raise ValueError(f"column {str(name)[:80]!r}: names must be printable, of 1 to {LONGEST_NAME} characters")
         if column.dtype.kind not in ARRAYS:
             raise ValueError(f"column {name!r} holds Python objects; only numbers and strings can be saved")
         arrays[name] = column
-    # Nothing is pickled: columns of objects were refused above.
+    if max(len(recordings.trajectories), layout.n_dofs) > MOST:
+        raise ValueError(
+            f"{len(recordings.trajectories)} demonstrations of {layout.n_dofs} DoFs, expected at most {MOST} of each"
+        )
+    size = sum(array.nbytes + 256 for array in arrays.values())
+    if size > LIMIT:
+        raise ValueError(f"{size} bytes of recordings, at most {LIMIT}: write them to several files")
     with atomic_write(path) as file:
-        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+        _write_arrays(file, arrays, zipfile.ZIP_DEFLATED)
+        if size > max(DENSE, SHRUNK * file.tell()):
+            file.seek(0)
+            file.truncate()
+            _write_arrays(file, arrays, zipfile.ZIP_STORED)
+
+
+def _write_arrays(file: IO[bytes], arrays: Mapping[str, Array], method: int) -> None:
+    """What numpy's `savez` writes, but for names that are arguments of its own."""
+    with zipfile.ZipFile(file, "w", method, allowZip64=True) as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                # Nothing is pickled: columns of objects were refused.
+                np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)
 
 
 def read_npz(path: str | os.PathLike[str], limit: int = LIMIT) -> Recordings:
@@ -62,7 +95,8 @@ def read_npz(path: str | os.PathLike[str], limit: int = LIMIT) -> Recordings:
 
     Args:
         path: of the file.
-        limit: bytes of its arrays, unpacked; more is refused before it is unpacked.
+        limit: bytes of its arrays, unpacked; more is refused before it is unpacked. So are more than `DENSE` in an
+            archive that shrank them to less than 1 / `SHRUNK`.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -70,7 +104,10 @@ def read_npz(path: str | os.PathLike[str], limit: int = LIMIT) -> Recordings:
             its arrays contradict each other.
     """
     arrays: dict[str, Array] = {}
-    with open_archive(path, limit, (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)) as (_, archive):
+    with open_archive(path, limit, (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)) as (file, archive):
+        size, packed = sum(member.file_size for member in archive.infolist()), file.seek(0, os.SEEK_END)
+        if size > max(DENSE, SHRUNK * packed):
+            raise ValueError(f"{path}: {packed} bytes that unpack to {size}: no recording shrinks like that")
         for member in archive.infolist():
             name = member.filename.removesuffix(".npy")
             if name == member.filename:

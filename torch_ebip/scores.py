@@ -7,7 +7,10 @@ import math
 import torch
 from torch import Tensor
 
+from torch_ebip.ambient import without_autocast
 
+
+@without_autocast
 def crps(members: Tensor, target: Tensor, weights: Tensor | None = None, fair: bool = True) -> Tensor:
     """Continuous ranked probability score, fair for finite ensembles (Ferro 2014), in O(E log E) by sorting.
 
@@ -58,6 +61,7 @@ def gaussian_crps(mean: Tensor, variance: Tensor, target: Tensor) -> Tensor:
     return torch.where(positive, score, (target - mean).abs())
 
 
+@without_autocast
 def energy_score(members: Tensor, target: Tensor) -> Tensor:
     """The CRPS of a vector: mean_j |x_j - y| - sum_jk |x_j - x_k| / (2 E (E - 1)), Euclidean norms.
 

@@ -222,10 +222,15 @@ def test_it_goes_when_nobody_holds_it() -> None:
 
 
 def test_only_so_many_plans_are_kept() -> None:
-    live = LiveFilter(ebip(small_primitive()))
-    for number in range(2, 32):
-        live.update(torch.ones(5), torch.tensor([bool(number >> bit & 1) for bit in range(5)]))
-    assert len(live._plans) == 30
+    filter = ebip(small_primitive(torch.float64), square_root=True)
+    live, state = LiveFilter(filter), filter.initial_state()
+    with torch.no_grad():
+        for number in [*range(2, 32), *range(2, 32)]:  # each set of DoFs is measured twice
+            observed = torch.tensor([bool(number >> bit & 1) for bit in range(5)])
+            y = filter.project(state) + 0.01
+            live.update(y, observed)
+            state, _ = filter.update(state, y, observed)
+    torch.testing.assert_close(live.state.members, state.members)
     store: OrderedDict[tuple[bool, ...], int] = OrderedDict()
     for number in range(PLANS + 5):
         kept(store, tuple(bool(number >> bit & 1) for bit in range(8)), lambda key: sum(key))
@@ -257,8 +262,9 @@ def test_generators_are_one_for_each_entry() -> None:
 
 def test_a_covariance_that_cannot_be_factored_names_the_sensor() -> None:
     filter: EnsembleFilter = ebip(small_primitive())
-    live = LiveFilter(filter, HUMAN)
-    live._members[2:] = torch.nan
+    state = filter.initial_state()
+    state.deviations[:, 2:] = torch.nan
+    live = LiveFilter(filter, HUMAN, state=state)
     with pytest.raises(ValueError, match=r"cannot be factored.*hand\.x"):
         live.update(torch.ones(5), HUMAN)
 

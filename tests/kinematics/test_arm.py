@@ -197,7 +197,7 @@ def test_errors_say_what_was_expected_and_what_came(tmp_path) -> None:  # type: 
         ('<axis xyz="0 0 1"/><limit', '<axis xyz="0 0 0"/><limit', "expected an axis with a direction"),
         ('upper="2"', 'upper="nan"', "joint 'j2': expected a finite number"),
         ('upper="2"', 'upper="-2"', "expected limits, got -1.0 to -2.0"),
-        ('velocity="3"', "", "joint 'j2': expected a finite number"),
+        ('velocity="3"', 'velocity="fast"', "joint 'j2': expected a finite number, got 'fast'"),
         ('name="j2"', 'name="j1"', "joints of different names"),
         ('<child link="side"/>', '<child link="tip"/>', "two joints above 'tip'"),
         ("<robot", "<sdf", "does not parse"),

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import math
 import os
+import resource
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +19,7 @@ import torch
 from tests.session.test_session import filters, live, primitive, samples
 from torch_ebip import ebip
 from torch_ebip.session import InteractionSession, replay
-from torch_ebip.session.log import SessionLog
+from torch_ebip.session.session import fingerprint
 
 
 def record(path: Path, name: str = "ebip with options") -> InteractionSession:
@@ -183,26 +186,76 @@ def test_settings_of_any_library_are_recorded(tmp_path: Path) -> None:
     assert replay(tmp_path / "log.jsonl", filters()["ebip with options"], primitive()).identical
 
 
-def test_a_full_disk_ends_the_recording_and_not_the_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    session = live(record=tmp_path / "log.jsonl")
+@contextmanager
+def full_disk(size: int) -> Iterator[None]:
+    """No file can grow beyond so many bytes."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_full_disk_ends_the_recording_and_not_the_session(tmp_path: Path) -> None:
+    path = tmp_path / "log.jsonl"
+    session = live(record=path)
     stream = samples()
-    for sensor, value, time in stream[:20]:
-        session.push(sensor, value, time)
-    written = (tmp_path / "log.jsonl").read_text()
+    for sample in stream[:20]:
+        session.push(*sample)
+    written = path.read_text()
+    with full_disk(path.stat().st_size):
+        with pytest.warns(UserWarning, match=r"log\.jsonl: (the recording ends here|the last lines may be missing)"):
+            session.push(*stream[20])
+        session.push(*stream[21])
+        assert bool(session.forecast(0.1).mean.isfinite().all())
+    session.push(*stream[22])
+    session.close()
+    assert path.read_text() == written
 
-    class Full:
-        def write(self, text: str) -> int:
-            raise OSError(errno.ENOSPC, "No space left on device")
 
-        def close(self) -> None:
-            raise OSError(errno.ENOSPC, "No space left on device")
+def test_a_recording_that_starts_on_a_full_disk_names_its_path_and_leaves_nothing(tmp_path: Path) -> None:
+    with full_disk(0), pytest.raises(OSError, match=r"File too large: .*log\.jsonl"):
+        live(record=tmp_path / "log.jsonl")
+    assert not list(tmp_path.iterdir())
+    live(record=tmp_path / "log.jsonl").close()
 
-    log = session._log
-    assert isinstance(log, SessionLog)
-    monkeypatch.setattr(log, "_file", Full())
-    with pytest.warns(UserWarning, match="recording ends here|last lines may be missing"):
-        session.push(*stream[20])
-    session.push(*stream[21])
-    assert bool(session.forecast(0.1).mean.isfinite().all())
-    assert not log.open
-    assert (tmp_path / "log.jsonl").read_text() == written
+
+@pytest.mark.parametrize(
+    ("settings", "entries", "message"),
+    [
+        ({"window": 70.0}, [], "a window or a gap of more than 2000 ticks"),
+        ({"longest_gap": 1e5}, [], "a window or a gap of more than 2000 ticks"),
+        (
+            {"longest_gap": 60.0},
+            [["advance", 50.0], ["advance", 100.0], ["advance", 150.0]],
+            "ticks to filter already",
+        ),
+    ],
+)
+def test_a_few_bytes_do_not_ask_for_minutes_of_work(
+    settings: dict[str, float], entries: list[Any], message: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "log.jsonl"
+    live(record=path).close()
+    header = json.loads(path.read_text())
+    header["settings"] |= settings
+    path.write_text("\n".join(map(json.dumps, [header, *entries])) + "\n")
+    began = time.monotonic()
+    with pytest.raises(ValueError, match=message):
+        replay(path, filters()["ebip with options"], primitive())
+    assert time.monotonic() - began < 10
+
+
+def test_a_window_does_not_ask_for_gigabytes(tmp_path: Path) -> None:
+    path = tmp_path / "log.jsonl"
+    live(record=path).close()
+    header = json.loads(path.read_text())
+    header["settings"]["window"] = 33.0
+    big = ebip(primitive(), 3000)
+    header["filter"] = fingerprint(big)
+    path.write_text(json.dumps(header) + "\n")
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(ValueError, match=r"a window whose states take \d+ bytes"):
+        replay(path, big, primitive())
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000

@@ -7,6 +7,8 @@ from abc import ABC, abstractmethod
 import torch
 from torch import Tensor, nn
 
+from torch_ebip.arguments import as_count
+
 
 class Basis(nn.Module, ABC):
     """B functions of phase, Phi(phi): the paper's Section III-A.
@@ -25,9 +27,7 @@ class Basis(nn.Module, ABC):
 
     def __init__(self, n_features: int) -> None:
         super().__init__()
-        if n_features < 1:
-            raise ValueError(f"{type(self).__name__} needs at least one function, got {n_features}")
-        self.n_features = n_features
+        self.n_features = as_count(f"n_features of {type(self).__name__}", n_features)
 
     @abstractmethod
     def evaluate(self, phase: Tensor) -> tuple[Tensor, Tensor]:

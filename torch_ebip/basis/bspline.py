@@ -8,6 +8,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torch_ebip.ambient import owned
+from torch_ebip.arguments import as_count
 from torch_ebip.basis.base import Basis
 
 
@@ -27,17 +29,18 @@ class BSplineBasis(Basis):
     pieces: Tensor  # [n_pieces, degree + 1, n_features], coefficients of powers of the local coordinate
 
     def __init__(self, n_features: int, degree: int = 3) -> None:
-        if degree < 0 or n_features < degree + 1:
+        degree, n_features = as_count("degree of BSplineBasis", degree, 0), as_count("n_features", n_features)
+        if n_features < degree + 1:
             raise ValueError(f"BSplineBasis: degree {degree} needs n_features >= {degree + 1}, got {n_features}")
         super().__init__(n_features)
         self.degree = degree
         pieces = n_features - degree
         # A piece is a polynomial of this degree in the local coordinate u in [0, 1]: found from degree + 1 points.
-        points = torch.linspace(0, 1, degree + 2, dtype=torch.float64)[:-1] + 0.5 / (degree + 1)
-        phases = (torch.arange(pieces, dtype=torch.float64)[:, None] + points) / pieces
-        vandermonde = points[:, None] ** torch.arange(degree + 1)
+        points = torch.linspace(0, 1, degree + 2, dtype=torch.float64, device="cpu")[:-1] + 0.5 / (degree + 1)
+        phases = (torch.arange(pieces, dtype=torch.float64, device="cpu")[:, None] + points) / pieces
+        vandermonde = points[:, None] ** torch.arange(degree + 1, device="cpu")
         values = _cox_de_boor(phases, n_features, degree)
-        self.register_buffer("pieces", torch.linalg.solve(vandermonde, values), persistent=False)
+        self.register_buffer("pieces", owned(torch.linalg.solve(vandermonde, values)), persistent=False)
 
     def evaluate(self, phase: Tensor) -> tuple[Tensor, Tensor]:
         """Values and slopes, from the polynomial pieces; see `Basis.evaluate`."""
@@ -60,7 +63,7 @@ class BSplineBasis(Basis):
 def _cox_de_boor(phase: Tensor, n_features: int, degree: int) -> Tensor:
     """Values [..., n_features] at phases [...] inside pieces, by the Cox-de Boor recurrence."""
     pieces = n_features - degree
-    inner = torch.linspace(0, 1, pieces + 1, dtype=phase.dtype)
+    inner = torch.linspace(0, 1, pieces + 1, dtype=phase.dtype, device=phase.device)
     knots = torch.cat([inner.new_zeros(degree), inner, inner.new_ones(degree)])
     piece = (phase * pieces).floor().long() + degree
     values = torch.nn.functional.one_hot(piece, len(knots) - 1).to(phase)

@@ -7,6 +7,8 @@ from abc import abstractmethod
 import torch
 from torch import Tensor
 
+from torch_ebip.ambient import owned
+from torch_ebip.arguments import as_number
 from torch_ebip.basis.base import Basis
 
 
@@ -34,15 +36,14 @@ class CentredBasis(Basis):
         if count < 1:
             raise ValueError(f"{name}: n_features={n_features} leaves no function beside the offset")
         self.offset = offset
-        self.width = self.share_of_spacing / max(count - 1, 1) if width is None else float(width)
-        if not 0 < self.width < float("inf"):
-            raise ValueError(f"{name}: width must be a positive phase, got {width}")
-        middle = torch.tensor([0.5], dtype=torch.float64)
-        centres = middle if count == 1 else torch.linspace(0, 1, count, dtype=torch.float64)
+        width = self.share_of_spacing / max(count - 1, 1) if width is None else width
+        self.width = as_number(f"{name}: width", width, 0, above=True, of="in phase")
+        middle = torch.tensor([0.5], dtype=torch.float64, device="cpu")
+        centres = middle if count == 1 else torch.linspace(0, 1, count, dtype=torch.float64, device="cpu")
         # Tensors: arithmetic with a Python number first makes one of it, which costs more than small arithmetic.
-        steepness = torch.tensor(1 / (self.stretch * self.width), dtype=torch.float64)
-        self.register_buffer("steepness", steepness, persistent=False)
-        self.register_buffer("offsets", -centres * steepness, persistent=False)
+        steepness = torch.tensor(1 / (self.stretch * self.width), dtype=torch.float64, device="cpu")
+        self.register_buffer("steepness", owned(steepness), persistent=False)
+        self.register_buffer("offsets", owned(-centres * steepness), persistent=False)
 
     @abstractmethod
     def curve(self, distance: Tensor) -> Tensor:

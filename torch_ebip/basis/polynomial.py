@@ -11,6 +11,7 @@ import math
 import torch
 from torch import Tensor
 
+from torch_ebip.arguments import as_count
 from torch_ebip.basis.base import Basis
 
 
@@ -25,7 +26,7 @@ class PolynomialBasis(Basis):
     """
 
     def __init__(self, degree: int) -> None:
-        if not 0 <= degree <= 20:
+        if as_count("degree of PolynomialBasis", degree, 0) > 20:
             raise ValueError(f"PolynomialBasis: degree must be between 0 and 20, got {degree}")
         super().__init__(degree + 1)
         self.degree = degree

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torch_ebip.ambient import without_autocast
 from torch_ebip.basis.base import Basis
 from torch_ebip.demonstrations import Demonstrations
 
@@ -68,6 +69,7 @@ class Fit(NamedTuple):
     residuals: Tensor
 
 
+@without_autocast
 def regress(basis: Basis, samples: Samples) -> Fit:
     """Weighted least squares by normal equations in float64, for all demonstrations and DoFs at once.
 
@@ -82,8 +84,8 @@ def regress(basis: Basis, samples: Samples) -> Fit:
     gram = (weight @ outer).reshape(*weight.shape[:-1], count, count)
     moments = (weight * samples.values.transpose(-1, -2)) @ features
     # Relative to the trace, 1e-12 is above rounding and far below any effect on the fit.
-    ridge = 1e-12 * gram.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None] * torch.eye(count).to(gram)
-    factor = torch.linalg.cholesky(gram + ridge)
+    ridge = 1e-12 * gram.diagonal(dim1=-2, dim2=-1).mean(-1, keepdim=True)
+    factor = torch.linalg.cholesky(gram + torch.diag_embed(ridge.expand(*ridge.shape[:-1], count)))
     weights = torch.cholesky_solve(moments.unsqueeze(-1), factor).squeeze(-1)
     # Once more for what is left: values that lie far from 0 leave by ridge and rounding what matters beside their
     # spread (iterative refinement).
@@ -119,6 +121,7 @@ def measured_variance(samples: Samples, resolution: float) -> Tensor:
     return torch.where(variance > (resolution * mean).square(), variance, 0)
 
 
+@without_autocast
 def correlation_time(fit: Fit, samples: Samples) -> Tensor:
     """[D]: integrated autocorrelation time of the residuals, in samples; 1 for white ones.
 

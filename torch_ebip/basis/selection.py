@@ -116,7 +116,7 @@ def _fit(layout: Layout, basis: Basis, samples: Samples, floor: Tensor) -> list[
     n = counts.to(samples.values)
     terms = n * (mean_squared_residual(fit, samples) + floor).log() + basis.n_features * n.log()
     bic = torch.where(counts > 0, terms, 0).sum(0)
-    steps = torch.arange(samples.observed.shape[1]).to(counts).view(1, -1, 1)
+    steps = torch.arange(samples.observed.shape[1], device=counts.device).view(1, -1, 1)
     first = torch.where(samples.observed, steps, len(steps[0]) - 1).amin(1, keepdim=True)
     last = torch.where(samples.observed, steps, 0).amax(1, keepdim=True)
     start, end = (fit.residuals.gather(1, at).squeeze(1).abs() for at in (first, last))

@@ -9,6 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torch_ebip.ambient import without_autocast
+from torch_ebip.arguments import as_mask
 from torch_ebip.basis.base import Basis
 
 
@@ -43,6 +45,9 @@ class StackedBasis(nn.Module):
         super().__init__()
         if not bases:
             raise ValueError("StackedBasis needs a basis for at least one DoF")
+        for basis in bases:
+            if not isinstance(basis, Basis):
+                raise ValueError(f"StackedBasis needs bases, one for each DoF, got {basis!r}")
         unique = list(dict.fromkeys(bases))
         self.unique = nn.ModuleList(unique)
         self._basis_of_dof = tuple(unique.index(basis) for basis in bases)
@@ -79,15 +84,15 @@ class StackedBasis(nn.Module):
 
     def dof_of_weight(self) -> Tensor:
         """int64 [n_weights]: which DoF a weight belongs to."""
-        counts = torch.tensor([part.stop - part.start for part in self._weight_slices])
-        return torch.repeat_interleave(torch.arange(self.n_dofs), counts)
+        counts = torch.tensor([part.stop - part.start for part in self._weight_slices], device="cpu")
+        return torch.repeat_interleave(torch.arange(self.n_dofs, device="cpu"), counts)
 
     def select(self, dofs: Tensor) -> StackedBasis:
         """The stack of some DoFs only: bool [D], at least one True."""
-        if dofs.shape != (self.n_dofs,) or dofs.dtype != torch.bool:
-            raise ValueError(f"dofs must be bool [{self.n_dofs}], got {dofs.dtype} {tuple(dofs.shape)}")
+        dofs = as_mask("dofs", dofs, self.n_dofs)
         return StackedBasis([basis for basis, chosen in zip(self.bases, dofs.tolist(), strict=True) if chosen])
 
+    @without_autocast
     def project(
         self, phase: Tensor, weights: Tensor, dofs: Sequence[int] | None = None, centre: Tensor | None = None
     ) -> Tensor:
@@ -106,10 +111,12 @@ class StackedBasis(nn.Module):
         projections = self._project(features, weights, dofs)
         return projections if centre is None else projections + self._paths(features, centre, dofs)
 
+    @without_autocast
     def project_derivative(self, phase: Tensor, weights: Tensor) -> Tensor:
         """dh/dphi, shapes as `project`: the first column of the paper's Jacobian (equation of H_t)."""
         return self._project([basis.derivative(phase) for basis in self.families], weights, None)
 
+    @without_autocast
     def project_rows(self, phase: Tensor, matrix: Tensor) -> Tensor:
         """h(phi, row) of every row of a matrix: with a covariance of the weights, the product with dh/dw'.
 
@@ -130,6 +137,7 @@ class StackedBasis(nn.Module):
             parts.append((flat @ features[run.basis].unsqueeze(-1)).reshape(shape))
         return torch.cat(parts, dim=-1)
 
+    @without_autocast
     def project_paths(self, phase: Tensor, weights: Tensor, dofs: Sequence[int] | None = None) -> Tensor:
         """h(phi, w) of each set of weights at several phases.
 
@@ -143,6 +151,7 @@ class StackedBasis(nn.Module):
         """
         return self._paths([basis(phase) for basis in self.families], weights, dofs)
 
+    @without_autocast
     def project_covariance(self, phase: Tensor, covariance: Tensor) -> Tensor:
         """Variance of h(phi, w) for normal weights, Phi_d Sigma_dd Phi_d' for each DoF d.
 
@@ -200,8 +209,9 @@ class StackedBasis(nn.Module):
         return runs
 
     def extra_repr(self) -> str:
-        """Sizes."""
-        return f"n_dofs={self.n_dofs}, n_weights={self.n_weights}"
+        """Sizes, and for how many neighbouring DoFs each basis serves."""
+        runs = ", ".join(f"{run.dofs.stop - run.dofs.start} x ({run.basis})" for run in self._runs)
+        return f"n_dofs={self.n_dofs}, n_weights={self.n_weights}, bases={runs}"
 
 
 def _select(block: Tensor, run: _Run, wanted: list[int]) -> Tensor:

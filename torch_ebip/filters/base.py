@@ -10,13 +10,36 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torch_ebip.ambient import eager, outside_inference
+from torch_ebip.arguments import as_count, as_number, as_seconds, as_values
 from torch_ebip.draws import Generators
 from torch_ebip.filters.attribution import affine_coefficients
 from torch_ebip.filters.forecast import Forecast
 from torch_ebip.filters.model import InteractionModel, select_dofs
-from torch_ebip.filters.sequence import Segment, State, assemble, checkpointed, pick
+from torch_ebip.filters.sequence import Segment, State, assemble, checkpointed, map_state, pick
 from torch_ebip.functional import FactorisationError
+from torch_ebip.functional.linear import truth
+from torch_ebip.meaning import Meaning
 from torch_ebip.noise.pair import FilterNoise
+
+
+def as_phases(phase: Tensor | float, like: Tensor) -> Tensor:
+    """Phases [P] or [..., P] of a forecast, in the dtype and on the device of ``like``; one number is [1].
+
+    Raises:
+        ValueError: NaN or infinity, or no numbers at all.
+    """
+    if not isinstance(phase, Tensor):
+        phase = as_values("phase", phase, None, like)
+    phase = outside_inference(phase.to(like))
+    if not bool(phase.isfinite().all()):
+        raise ValueError("phases must be finite numbers, got NaN or infinity")
+    return phase.reshape(1) if phase.ndim == 0 else phase
+
+
+def _usable(state: State) -> State:
+    """The state, a copy if it was made in inference mode and is used outside of it."""
+    return map_state(outside_inference, state) if state[0].is_inference() else state
 
 
 class Trace(NamedTuple):
@@ -37,7 +60,7 @@ class Trace(NamedTuple):
     kept: State | None
 
 
-class Filter(nn.Module, ABC):
+class Filter(Meaning, ABC):
     """A Bayesian filter over interactions, differentiable in its noise parameters.
 
     Args:
@@ -63,15 +86,16 @@ class Filter(nn.Module, ABC):
         dof_names: tuple[str, ...] | None = None,
     ) -> None:
         super().__init__()
-        if not dt > 0:
-            raise ValueError(f"dt must be a positive number of seconds, got {dt}")
+        dt = as_number("dt", dt, 0, above=True, of="of seconds")
         self.dynamics = dynamics
         self.observation = observation
         self.noise = noise
         self.prior = prior
-        self.n_dofs = n_dofs
+        self.n_dofs = as_count("n_dofs", n_dofs)
         self.dt = dt
-        self.thinning = thinning
+        self.thinning = as_count("thinning", thinning)
+        if dof_names is not None and len(dof_names) != n_dofs:
+            raise ValueError(f"dof_names must be {n_dofs} names, one for each DoF, got {len(dof_names)}")
         self.dof_names = dof_names
 
     @abstractmethod
@@ -154,10 +178,16 @@ class Filter(nn.Module, ABC):
             raise ValueError(f"forecasts are no combination of the demonstrations: {reason}")
         return affine_coefficients(states[:, 2:], state.mean[..., 2:])
 
+    def meant(self) -> str:
+        """What its tensors mean, see `Meaning`: of which DoFs they are, in this order, at which rate."""
+        dofs = f"{self.n_dofs} of them" if self.dof_names is None else ", ".join(self.dof_names)
+        return f"dofs={dofs}; dt={self.dt / self.thinning:.9g}"
+
     def _leaves_span(self) -> str | None:
         """What moves weights out of the span of the demonstrations, if anything does."""
         return "weights have process noise" if getattr(self.noise.process, "weights", None) is not None else None
 
+    @eager
     def predict(self, state: State, dt: float | Tensor, generator: Generators = None) -> State:
         """Propagate.
 
@@ -165,9 +195,13 @@ class Filter(nn.Module, ABC):
             state: of this filter.
             dt: seconds: a number, or a tensor [...] with one for each entry of the batch.
             generator: of the draws.
-        """
-        return self._predict(state, torch.as_tensor(dt, dtype=state[0].dtype, device=state[0].device), generator)
 
+        Raises:
+            ValueError: a dt that is negative, NaN or infinite.
+        """
+        return self._predict(_usable(state), as_seconds(dt, state[0]), generator)
+
+    @eager
     def update(
         self,
         state: State,
@@ -188,11 +222,12 @@ class Filter(nn.Module, ABC):
             has log-likelihood 0.
 
         Raises:
-            ValueError: wrong shapes; NaN or infinity where observed; an innovation covariance that cannot
+            ValueError: wrong shapes or dtypes; NaN or infinity where observed; an innovation covariance that cannot
                 be factored.
         """
-        return self._update(state, *self._checked(y, observed), generator)
+        return self._update(_usable(state), *self._checked(y, observed, state[0]), generator)
 
+    @eager
     def forward(
         self,
         y: Tensor,
@@ -224,29 +259,35 @@ class Filter(nn.Module, ABC):
             project: whether to compute `Trace.projection`.
 
         Raises:
-            ValueError: wrong shapes, NaN or infinity where observed, a step to keep that there is not.
+            ValueError: wrong shapes or dtypes, NaN or infinity where observed, a step to keep that there is not, a dt
+                that is negative, NaN or infinite.
         """
-        y, observed = self._checked(y, observed)
+        like = next(self.parameters(), None) if state is None else state[0]
+        y, observed = self._checked(y, observed, like)
         if y.ndim < 2 or y.shape[-2] < 1:
             raise ValueError(f"y must be [..., T, {self.n_dofs}] with at least one sample, got {tuple(y.shape)}")
         batch, length = y.shape[:-2], y.shape[-2]
         if generator is not None and not isinstance(generator, torch.Generator) and len(generator) != (*batch, 0)[0]:
             raise ValueError(f"{len(generator)} generators for a batch {list(batch)}: needs one for each entry")
+        if segment is not None:
+            segment = as_count("segment", segment)
         if state is None:
             state = self.initial_state(batch, generator=generator)
         elif state[0].shape[: len(batch)] != batch:
             raise ValueError(f"the state's batch does not begin with {list(batch)}: {list(state[0].shape)}")
-        if keep is not None and (
-            keep.shape[:-1] != batch or keep.numel() == 0 or int(keep.min()) < 0 or int(keep.max()) >= length
-        ):
-            raise ValueError(f"keep must be [{', '.join(map(str, batch))}, K] with steps 0..{length - 1}, got {keep}")
+        state = _usable(state)
+        step = as_seconds(self.dt if dt is None else dt, state[0])
+        if keep is not None:
+            whole = not keep.is_floating_point() and keep.shape[:-1] == batch and keep.numel() > 0
+            if not whole or int(keep.min()) < 0 or int(keep.max()) >= length:
+                shape = ", ".join(map(str, batch))
+                raise ValueError(f"keep must be [{shape}, K] with steps 0..{length - 1}, got {keep}")
         if not torch.is_grad_enabled():
             trace = self._without_gradients(
                 y, observed, self.dt if dt is None else dt, state, generator, keep, project
             )
             if trace is not None:
                 return trace
-        step = torch.as_tensor(self.dt if dt is None else dt, dtype=state[0].dtype, device=state[0].device)
 
         def run(state: State, start: int, stop: int, generator: Generators) -> Segment:
             """Samples start to stop - 1."""
@@ -311,9 +352,12 @@ class Filter(nn.Module, ABC):
         names = (self.dof_names[i if rows is None else int(rows[i])] for i in error.dofs)
         return ValueError(f"{error} ({', '.join(names)})")
 
-    def _checked(self, y: Tensor, observed: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _checked(self, y: Tensor, observed: Tensor | None, like: Tensor | None) -> tuple[Tensor, Tensor]:
+        y = outside_inference(as_values("y", y, self.dof_names, like))
         if y.shape[-1:] != (self.n_dofs,):
             raise ValueError(f"y must end in {self.n_dofs}, one value for each DoF, got {tuple(y.shape)}")
+        if observed is not None and not isinstance(observed, Tensor):
+            observed = torch.as_tensor(observed, device=y.device)
         if observed is None:
             observed = ~y.isnan()
         elif observed.dtype != torch.bool or observed.shape[-1:] != (self.n_dofs,):
@@ -321,7 +365,7 @@ class Filter(nn.Module, ABC):
                 f"observed must be bool and end in {self.n_dofs}, got {observed.dtype} {tuple(observed.shape)}"
             )
         bad = observed & ~y.isfinite()
-        if bool(bad.any()):
+        if truth(bad.any(), "a filter takes batches itself: give it y [..., T, D] instead"):
             columns = bad.reshape(-1, self.n_dofs).any(0).nonzero().squeeze(-1).tolist()
             raise ValueError(f"y is NaN or infinite where it is observed, in DoFs {columns[:8]}; mark it False there")
         return y, observed.expand(y.shape)

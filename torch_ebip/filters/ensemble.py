@@ -6,6 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from torch_ebip import functional
+from torch_ebip.ambient import eager, owned
+from torch_ebip.arguments import as_number
 from torch_ebip.draws import Generators, is_several, standard_normal
 from torch_ebip.filters.base import Trace
 from torch_ebip.filters.evidence import EvidenceWeighting
@@ -48,7 +50,8 @@ class EnsembleFilter(MemberFilter):
         dof_names: for error messages.
 
     Raises:
-        ValueError: fewer than two members, or weighting without a basis projection.
+        ValueError: fewer than two members, an inflation that is not positive, or weighting without a basis
+            projection.
     """
 
     columns: Tensor | None
@@ -72,13 +75,16 @@ class EnsembleFilter(MemberFilter):
     ) -> None:
         super().__init__(dynamics, observation, noise, prior, n_members, n_dofs, dt, thinning, dof_names)
         self.square_root = square_root
+        if inflation is not None and not isinstance(inflation, nn.Module):
+            inflation = as_number("inflation", inflation, 0, above=True)
         self.inflation = inflation
         self.localisation = localisation
         self.weighting = weighting
         if weighting is not None and not isinstance(observation, BasisProjection):
             raise ValueError("evidence weights need demonstrations behind the members, and so a BasisProjection")
-        self.register_buffer("columns", columns)
+        self.register_buffer("columns", None if columns is None else owned(columns))
 
+    @eager
     def initial_state(
         self,
         batch_shape: tuple[int, ...] = (),
@@ -165,7 +171,7 @@ class EnsembleFilter(MemberFilter):
             origin, offsets = evidence.origin, self.weighting.offsets
         dofs = None if rows is None else rows.tolist()
         phases, projections, paths = self.observation.measure(members, dofs, origin, offsets, state.centre)
-        return functional.ensemble_mean(phases.unsqueeze(-1), state.weights).squeeze(-1), projections, paths
+        return _mean_phase(phases, state.weights), projections, paths
 
     def _centre(self, state: EnsembleState) -> Tensor | None:
         """See `MemberFilter._centre`."""
@@ -183,11 +189,18 @@ class EnsembleFilter(MemberFilter):
         ):
             return state
         members = state.deviations
+        if members.ndim == 3 and len(members) > 1 and members.stride(0) == 0:  # the same ones for the whole batch
+            alike = self._taken_out(EnsembleState(members[0]))
+            assert alike.centre is not None
+            deviations, centre = alike.deviations.expand(members.shape), alike.centre.expand(len(members), -1)
+            return state._replace(deviations=deviations, centre=centre)
         low, high = torch.aminmax(members.detach(), dim=-2)
         middle = (0.5 * (low + high)).nan_to_num()
         near = torch.where(middle < 0, -high, low) >= 0.5 * middle.abs()
         near &= torch.where(middle < 0, -low, high) <= 2 * middle.abs()
         near[..., :2] = False
+        if not bool(near.any()):
+            return state._replace(centre=torch.zeros_like(middle))
         centre = torch.where(near, middle, 0)
         return state._replace(deviations=members - centre.unsqueeze(-2), centre=centre)
 
@@ -264,3 +277,8 @@ class EnsembleFilter(MemberFilter):
     def extra_repr(self) -> str:
         """The options that are not modules."""
         return f"n_members={self.n_members}, square_root={self.square_root}, thinning={self.thinning}"
+
+
+def _mean_phase(phases: Tensor, weights: Tensor | None) -> Tensor:
+    """Of members [..., E]; a phase never lies far from 0 compared with what it differs by."""
+    return phases.mean(-1) if weights is None else (phases * weights).sum(-1)

@@ -17,6 +17,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torch_ebip.ambient import owned
+from torch_ebip.arguments import as_number
 from torch_ebip.noise.constraints import Positive
 
 
@@ -74,17 +76,28 @@ class EvidenceWeighting(nn.Module):
         offsets: Sequence[float] = (-0.1, -0.05, 0.0, 0.05, 0.1),
     ) -> None:
         super().__init__()
-        if not 0 < defensive < 1:
+        for name, value in {
+            "sharpness": sharpness,
+            "forgetting": forgetting,
+            "slope": slope,
+            "wander": wander,
+        }.items():
+            as_number(name, value, 0, above=True)
+        if not 0 < as_number("defensive", defensive) < 1:
             raise ValueError(f"defensive must lie between 0 and 1, got {defensive}")
-        self.register_buffer("variance", variance)
-        self.register_buffer("modality_of_dof", modality_of_dof)
+        self.register_buffer("variance", owned(variance))
+        self.register_buffer("modality_of_dof", owned(modality_of_dof))
         self.sharpness = Positive(variance.new_tensor(sharpness))
         self.forgetting = Positive(variance.new_tensor(forgetting))
         self.slope = Positive(variance.new_tensor(slope))
         self.factor = Positive(variance.new_ones(int(modality_of_dof.max()) + 1))
         self.wander = Positive(variance.new_tensor(wander))
-        self.register_buffer("offsets", variance.new_tensor(offsets))
+        self.register_buffer("offsets", owned(variance.new_tensor(offsets)))
         self.defensive = defensive
+
+    def extra_repr(self) -> str:
+        """What is not learned."""
+        return f"defensive={self.defensive:g}"
 
     def start(self, members: Tensor) -> Evidence:
         """Equal weights for members [..., E, 2 + n_weights] that have seen nothing."""

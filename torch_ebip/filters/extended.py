@@ -14,9 +14,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torch_ebip.ambient import eager
 from torch_ebip.basis.base import Basis
 from torch_ebip.draws import Generators
-from torch_ebip.filters.base import Filter
+from torch_ebip.filters.base import Filter, as_phases
 from torch_ebip.filters.forecast import Forecast
 from torch_ebip.filters.interaction import BasisProjection, ConstantVelocityPhase
 from torch_ebip.filters.model import demonstration_states, interaction_model
@@ -64,6 +65,7 @@ class ExtendedFilter(Filter):
     ) -> None:
         super().__init__(dynamics, observation, noise, prior, n_dofs, dt, thinning, dof_names)
 
+    @eager
     def initial_state(
         self,
         batch_shape: tuple[int, ...] = (),
@@ -164,6 +166,7 @@ class ExtendedFilter(Filter):
     def _prior(self) -> MomentPrior:
         return self.prior  # type: ignore[return-value]
 
+    @eager
     def project(self, state: GaussianState) -> Tensor:
         """h(mu), [..., D]."""
         return self._observation.basis.project(state.mean[..., 0], state.mean[..., 2:])
@@ -172,10 +175,11 @@ class ExtendedFilter(Filter):
         """See `Filter.phase`."""
         return state.mean[..., 0]
 
+    @eager
     def forecast(self, state: GaussianState, phase: Tensor | None = None) -> Forecast:
         """h(phi, mu) and Phi(phi) Sigma_ww Phi(phi)' at phases to come; see `Filter.forecast`."""
         basis = self._observation.basis
-        phase = self._phases_ahead(state) if phase is None else phase
+        phase = self._phases_ahead(state) if phase is None else as_phases(phase, state.mean)
         phase = phase.to(state.mean).expand(*state.mean.shape[:-1], phase.shape[-1])
         mean = basis.project(phase, state.mean[..., 2:].unsqueeze(-2))
         # Where the prior is rank deficient rounding can leave less than nothing.

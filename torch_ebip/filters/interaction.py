@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from torch_ebip.arguments import as_number
 from torch_ebip.basis.stacked import StackedBasis
 
 
@@ -37,7 +38,11 @@ class ConstantVelocityPhase(nn.Module):
 
     def __init__(self, overrun: float = 0.05) -> None:
         super().__init__()
-        self.overrun = overrun
+        self.overrun = as_number("overrun", overrun, 0, above=True)
+
+    def extra_repr(self) -> str:
+        """How far a phase can get."""
+        return f"overrun={self.overrun:g}"
 
     def forward(self, members: Tensor, dt: Tensor) -> Tensor:
         """The members [..., E, n] after dt [...] seconds."""
@@ -80,7 +85,7 @@ class BasisProjection(nn.Module):
         With a centre [..., n] of members that are deviations from it.
         """
         phase, _, weights = split_state(members)
-        return self.basis.project(phase.squeeze(-1), weights, dofs, None if centre is None else centre[..., 2:])
+        return self.basis.project(phase.squeeze(-1), weights, dofs, _middle(centre))
 
     def measure(
         self,
@@ -107,8 +112,7 @@ class BasisProjection(nn.Module):
         if others is not None and offsets is not None:
             paths = self.basis.project_paths((phase + offsets).clamp(0, 1), others, dofs)
         phase = phase.squeeze(-1)
-        middle = None if centre is None else centre[..., 2:]
-        return phase, self.basis.project(phase, weights, dofs, middle), paths
+        return phase, self.basis.project(phase, weights, dofs, _middle(centre)), paths
 
     def phase(self, members: Tensor) -> Tensor:
         """Phase [..., E] of each of the members [..., E, n]."""
@@ -117,3 +121,8 @@ class BasisProjection(nn.Module):
     def at(self, members: Tensor, phase: Tensor) -> Tensor:
         """Projections [..., P, E, D] of members [..., E, n] at points of phase [..., P] that all of them share."""
         return self.basis.project_paths(phase.unsqueeze(-2), members[..., 2:]).transpose(-2, -3)
+
+
+def _middle(centre: Tensor | None) -> Tensor | None:
+    """The weights of a centre [..., n]; None if there is nothing to add, as where no weight lies far from 0."""
+    return None if centre is None or not bool(centre.any()) else centre[..., 2:]

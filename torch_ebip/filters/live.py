@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
+from torch_ebip.ambient import in_own_modes
+from torch_ebip.arguments import as_mask, as_number, as_values
 from torch_ebip.draws import Generators, is_several, set_states, standard_normal, states_of
 from torch_ebip.filters.evidence import Evidence
 from torch_ebip.filters.forecast import Forecast
@@ -69,6 +71,7 @@ class LiveFilter:
         TypeError: a filter that is not one of an interaction primitive.
     """
 
+    @in_own_modes
     @torch.no_grad()
     def __init__(
         self,
@@ -86,9 +89,9 @@ class LiveFilter:
             raise ValueError(f"a live filter has at most one batch dimension, got {list(batch_shape)}")
         if isinstance(generator, Sequence) and (not batch_shape or len(generator) != batch_shape[0]):
             raise ValueError(f"{len(generator)} generators for a batch {list(batch_shape)}: needs one for each entry")
-        dofs = torch.ones(filter.n_dofs, dtype=torch.bool) if dofs is None else dofs.cpu()
-        if dofs.shape != (filter.n_dofs,) or dofs.dtype != torch.bool or not bool(dofs.any()):
-            raise ValueError(f"dofs must be bool [{filter.n_dofs}], some True, got {dofs.dtype} {tuple(dofs.shape)}")
+        dofs = as_mask("dofs", [True] * filter.n_dofs if dofs is None else dofs, filter.n_dofs)
+        if not bool(dofs.any()):
+            raise ValueError(f"dofs must be bool [{filter.n_dofs}], some of them True: none may be measured")
         part = filter.restrict(dofs)
         assert isinstance(part.observation, BasisProjection)
         assert isinstance(part.dynamics, ConstantVelocityPhase)
@@ -132,17 +135,20 @@ class LiveFilter:
         """A copy of everything, for `filter`."""
         return self.entry(None)
 
+    @in_own_modes
     def entry(self, index: int | None) -> EnsembleState:
         """The state of one entry of the batch, without that dimension; of all for None."""
         return self._state(torch.arange(self._start.shape[-1] - 2, device=self._start.device), index)
 
     @property
+    @in_own_modes
     def phase(self) -> Tensor:
         """Mean phase [...]."""
         even = self._equal if self._evidence is None else self._evidence.weights.unsqueeze(-1)
         return (self._phase.unsqueeze(-2) @ even).squeeze((-1, -2))
 
     @property
+    @in_own_modes
     def phase_velocity(self) -> Tensor:
         """Mean phase velocity [...], 1/s."""
         even = self._equal if self._evidence is None else self._evidence.weights.unsqueeze(-1)
@@ -155,6 +161,7 @@ class LiveFilter:
         size = float(torch.dot(flat, flat))
         return math.isfinite(size if self._evidence is None else size + float(self._evidence.weights.sum()))
 
+    @in_own_modes
     @torch.no_grad()
     def save(self, into: LiveSnapshot | None = None) -> LiveSnapshot:
         """Everything that `predict` and `update` change, the generators' states included, for `load`.
@@ -165,6 +172,7 @@ class LiveFilter:
         matrix = self._members.clone() if into is None else into.matrix.copy_(self._members)
         return LiveSnapshot(matrix, self._evidence, self._growth, states_of(self.generator))
 
+    @in_own_modes
     @torch.no_grad()
     def load(self, snapshot: LiveSnapshot) -> None:
         """Go back to a snapshot of this filter: what follows gives the same numbers again, to the bit.
@@ -175,15 +183,16 @@ class LiveFilter:
         self._evidence, self._growth = snapshot.evidence, snapshot.growth
         set_states(self.generator, snapshot.generators)
 
+    @in_own_modes
     @torch.no_grad()
     def forecast(self, phase: Tensor | None = None, dofs: Tensor | None = None) -> Forecast:
         """See `Filter.forecast`; of some dofs only, bool [D], if given, which costs less than all."""
-        if dofs is not None and (dofs.shape != (self.filter.n_dofs,) or dofs.dtype != torch.bool):
-            raise ValueError(f"dofs must be bool [{self.filter.n_dofs}], got {dofs.dtype} {list(dofs.shape)}")
-        chosen = (True,) * self.filter.n_dofs if dofs is None else tuple(dofs.tolist())
+        D = self.filter.n_dofs
+        chosen = (True,) * D if dofs is None else tuple(as_mask("dofs", dofs, D).tolist())
         part, columns = kept(self._forecasters, chosen, self._make_forecaster)
         return part.forecast(self._state(columns), phase)
 
+    @in_own_modes
     @torch.no_grad()
     def project(self, dofs: tuple[bool, ...]) -> Tensor:
         """[..., D_chosen], mean of h(x) of some of the sensors' DoFs, a bool for each DoF of the filter."""
@@ -192,10 +201,17 @@ class LiveFilter:
         even = self._equal if self._evidence is None else self._evidence.weights.unsqueeze(-1)
         return (plan.project(self._phase) @ even).squeeze(-1)
 
+    @in_own_modes
     @torch.no_grad()
     def predict(self, dt: float | None = None) -> None:
-        """Propagate by dt seconds; default: the time between samples of the demonstrations."""
-        dt = self.filter.dt if dt is None else float(dt)
+        """Propagate by dt seconds; default: the time between samples of the demonstrations.
+
+        Raises:
+            ValueError: a dt that is negative, NaN or infinite.
+        """
+        dt = self.filter.dt if dt is None else dt
+        if not (type(dt) is float and 0 <= dt < math.inf):  # most of all calls
+            dt = as_number("dt", dt, 0, of="of seconds")
         if self._factor is None or self._factor[0] != dt:
             factor = self._process.phase_factor(self._phase.new_tensor(dt))
             self._factor = dt, factor.expand(*self.batch_shape, 2, 2)
@@ -213,7 +229,7 @@ class LiveFilter:
         """Take in one sample.
 
         Args:
-            y: [..., D] in units of the DoFs.
+            y: [..., D] in units of the DoFs: a tensor in the filter's dtype, an array or a list.
             observed: bool [..., D]; default: where y is not NaN.
 
         Returns:
@@ -223,8 +239,13 @@ class LiveFilter:
             ValueError: wrong shapes; infinity, or NaN where observed; a DoF that is none of the sensors'; an
                 innovation covariance that cannot be factored. The state is then as before, but for the draws made.
         """
+        if not isinstance(y, Tensor):
+            y = as_values("y", y, self.filter.dof_names, self._members)
+        if observed is not None and not isinstance(observed, Tensor):
+            observed = torch.as_tensor(observed, device=y.device)
         return self.take(y, *measured_dofs(y, observed, self._members, self.batch_shape, self.filter.n_dofs))
 
+    @in_own_modes
     @torch.no_grad()
     def take(self, y: Tensor, measured: tuple[bool, ...], mask: Tensor | None) -> Tensor:
         """`update` with arguments that were checked.
@@ -247,11 +268,10 @@ class LiveFilter:
         weights = None if self._evidence is None else self._evidence.weights.unsqueeze(-1)
         even = self._equal if weights is None else weights
         projections = plan.project(self._phase)
-        # Differences from one of the members first: the mean of values far from 0 is not exact enough.
-        reference = projections[..., :1]
-        anomalies = torch.sub(projections, reference, out=plan.anomalies)
-        shift = anomalies @ even
-        anomalies.sub_(shift)
+        mean = projections @ even
+        anomalies = torch.sub(projections, mean, out=plan.anomalies)
+        # Once more: a mean of values far from 0 is rounded, and products need anomalies that sum to 0.
+        anomalies.sub_(anomalies @ even)
         deviation, R = plan.measurement_noise(self._deviations)
         seen = None
         if mask is not None:
@@ -266,7 +286,7 @@ class LiveFilter:
             plan.check_finite(seen)
             spread = share * (anomalies * weighted.transpose(-1, -2)).sum(-1, keepdim=True)
             here = values if seen is None else torch.where(seen, values, 0)
-            values, wider, trust = self._robust(here, reference + shift, spread, deviation, self.filter.thinning)
+            values, wider, trust = self._robust(here, mean, spread, deviation, self.filter.thinning)
             if seen is not None:
                 wider, trust = torch.where(seen, wider, 0), torch.where(seen, trust, 0)
             R = R + torch.diag_embed((wider.square() - deviation.square())[..., 0])
@@ -275,7 +295,7 @@ class LiveFilter:
         factor, info = torch.linalg.cholesky_ex(S)
         if bool(info.any() if self.batch_shape else info):
             self._explain(S, plan)
-        residual = torch.sub(values, reference, out=plan.right_mean).sub_(shift)
+        residual = torch.sub(values, mean, out=plan.right_mean)
         if seen is not None:
             residual.masked_fill_(~seen, 0)
         if self.filter.square_root:
@@ -355,7 +375,7 @@ class LiveFilter:
         return dofs[observation.basis.dof_of_weight()].nonzero().squeeze(-1).to(self._start.device)
 
     def _make_forecaster(self, chosen: tuple[bool, ...]) -> tuple[EnsembleFilter, Tensor]:
-        dofs = torch.tensor(chosen)
+        dofs = torch.tensor(chosen, device="cpu")
         return (self.filter if all(chosen) else self.filter.restrict(dofs)), self._columns(dofs)
 
     def _state(self, columns: Tensor, entry: int | None = None) -> EnsembleState:

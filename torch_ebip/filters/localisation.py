@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from torch_ebip.ambient import owned
 from torch_ebip.functional import Taper
 from torch_ebip.noise.constraints import Positive
 
@@ -30,10 +31,14 @@ class Localisation(nn.Module):
     def __init__(self, names: tuple[str, ...], state_block: Tensor, dof_block: Tensor, start: float = 0.1) -> None:
         super().__init__()
         self.names = names
-        self.register_buffer("state_block", state_block)
-        self.register_buffer("dof_block", dof_block)
-        own = torch.eye(len(names))
+        self.register_buffer("state_block", owned(state_block))
+        self.register_buffer("dof_block", owned(dof_block))
+        own = torch.eye(len(names), device="cpu")
         self.loadings = Positive(start * own + 0.1 * start * (1 - own))
+
+    def extra_repr(self) -> str:
+        """The blocks."""
+        return f"names={', '.join(self.names)}"
 
     def select(self, state: Tensor, dofs: Tensor) -> Localisation:
         """The same factors, with the same parameters, for some entries of state int64 [k] and dofs int64 [m]."""

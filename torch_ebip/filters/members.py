@@ -9,8 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from torch_ebip import functional
+from torch_ebip.ambient import eager
+from torch_ebip.arguments import as_count
 from torch_ebip.draws import Generators
-from torch_ebip.filters.base import Filter
+from torch_ebip.filters.base import Filter, as_phases
 from torch_ebip.filters.evidence import Evidence
 from torch_ebip.filters.forecast import Forecast
 from torch_ebip.filters.interaction import BasisProjection, ConstantVelocityPhase
@@ -94,9 +96,9 @@ class MemberFilter(Filter):
         dof_names: tuple[str, ...] | None = None,
     ) -> None:
         super().__init__(dynamics, observation, noise, prior, n_dofs, dt, thinning, dof_names)
-        if n_members < 2:
+        if as_count("n_members", n_members) < 2:
             raise ValueError(f"an ensemble needs at least 2 members to have a spread, got {n_members}")
-        self.n_members = n_members
+        self.n_members = as_count("n_members", n_members)
 
     def _advance(self, members: Tensor, dt: Tensor, generator: Generators) -> Tensor:
         """g(x) + N(0, Q)."""
@@ -106,6 +108,7 @@ class MemberFilter(Filter):
             return process.add_(moved, dt, generator)  # what this g returns is new: one copy less
         return process(moved, dt, generator)  # type: ignore[no-any-return]
 
+    @eager
     def project(self, state: State) -> Tensor:
         """See `Filter.project`."""
         return functional.ensemble_mean(self._project_rows(state, None), state.weights)
@@ -136,13 +139,14 @@ class MemberFilter(Filter):
             return None
         return functional.ensemble_mean(phase_of(state[0]).unsqueeze(-1), state.weights).squeeze(-1)
 
+    @eager
     def forecast_members(self, state: State, phase: Tensor) -> Tensor:
         """Each member's trajectory, [..., P, E, D], that a state implies at a phase [P] or [..., P].
 
         Raises:
             TypeError: the observation knows no phase.
         """
-        departures, path = self._paths_ahead(state, phase)
+        departures, path = self._paths_ahead(state, as_phases(phase, state[0]))
         return departures if path is None else departures + path
 
     def _paths_ahead(self, state: State, phase: Tensor) -> tuple[Tensor, Tensor | None]:
@@ -154,13 +158,14 @@ class MemberFilter(Filter):
         phase = phase.to(members).expand(*members.shape[:-2], -1)
         return project_at(members, phase), None if centre is None else project_at(centre.unsqueeze(-2), phase)
 
+    @eager
     def forecast(self, state: State, phase: Tensor | None = None) -> Forecast:
         """Steps 4 and 5 of the paper's box: mean and variance over members of h at phases to come.
 
         At a given phase h is linear in the weights, so the mean of h is h of the mean, the paper's output.
         See `Filter.forecast`.
         """
-        phase = self._phases_ahead(state) if phase is None else phase
+        phase = self._phases_ahead(state) if phase is None else as_phases(phase, state[0])
         departures, path = self._paths_ahead(state, phase)
         phase = phase.to(departures).expand(departures.shape[:-2])
         weights = None if state.weights is None else state.weights.unsqueeze(-2).expand(departures.shape[:-1])

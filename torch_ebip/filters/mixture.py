@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from torch_ebip.ambient import owned
+from torch_ebip.arguments import as_count
 from torch_ebip.draws import Generators, standard_normal, uniform
 from torch_ebip.filters.priors import check_members, check_states
 
@@ -36,8 +38,8 @@ class MixturePrior(nn.Module):
         check_states(states)
         if responsibilities.ndim != 2 or len(responsibilities) != len(states):
             raise ValueError(f"responsibilities must be [{len(states)}, K], got {tuple(responsibilities.shape)}")
-        self.register_buffer("states", states)
-        self.register_buffer("responsibilities", responsibilities)
+        self.register_buffer("states", owned(states))
+        self.register_buffer("responsibilities", owned(responsibilities))
 
     def forward(
         self,
@@ -105,6 +107,7 @@ def fit_responsibilities(weights: Tensor, max_components: int, seed: int) -> Ten
     Raises:
         ImportError: scikit-learn is not installed; says how to install it.
     """
+    as_count("max_components", max_components)
     try:
         from sklearn.exceptions import ConvergenceWarning
         from sklearn.mixture import GaussianMixture

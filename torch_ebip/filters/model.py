@@ -8,6 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torch_ebip.ambient import in_own_modes
+from torch_ebip.arguments import as_mask, as_number, as_values
 from torch_ebip.basis.base import Basis
 from torch_ebip.filters.interaction import BasisProjection, ConstantVelocityPhase
 from torch_ebip.noise.measurement import MeasurementNoise, SelectedNoise
@@ -41,6 +43,7 @@ class InteractionModel(NamedTuple):
     dofs: Tensor
 
 
+@in_own_modes
 def interaction_model(
     primitive: InteractionPrimitive,
     residual_variance: Tensor | None = None,
@@ -49,6 +52,9 @@ def interaction_model(
     robust: RobustWeights | None = None,
 ) -> InteractionModel:
     """A model with parameters of its own, in the dtype and on the device of the primitive.
+
+    Raises:
+        ValueError: a variance that is not [D] or not positive; a rate that is not.
 
     Args:
         primitive: of the demonstrations.
@@ -63,10 +69,17 @@ def interaction_model(
     modality_of_dof = layout.modality_of_dof.to(weights.device)
     walk = None
     if weight_noise is not None:
+        weight_noise = as_number("weight_noise", weight_noise, 0, above=True)
         rates = weights.new_full((len(layout.modalities),), weight_noise)
         modality_of_weight = modality_of_dof[basis.dof_of_weight().to(weights.device)]
         walk = WeightNoise(rates, weights.std(0), modality_of_weight)
     variance = primitive.residual_variance if residual_variance is None else residual_variance
+    variance = as_values("residual_variance", variance, None, weights)
+    if variance.shape != (layout.n_dofs,):
+        raise ValueError(
+            f"residual_variance must be [{layout.n_dofs}], one variance for each of {', '.join(layout.dofs[:8])}, "
+            f"got {list(variance.shape)}"
+        )
     noise = FilterNoise(
         InteractionNoise(PhaseNoise(_acceleration(primitive)), walk),
         MeasurementNoise(variance.to(weights), context, modality_of_dof),
@@ -114,7 +127,7 @@ def select_dofs(
     ):
         raise TypeError("only filters of an interaction primitive can be restricted to some DoFs")
     device = process.phase.acceleration.start.device
-    dofs = dofs.to(device)
+    dofs = as_mask("dofs", dofs, observation.basis.n_dofs).to(device)
     index = dofs.nonzero().squeeze(-1)
     weights = dofs[observation.basis.dof_of_weight().to(device)].nonzero().squeeze(-1)
     return InteractionModel(

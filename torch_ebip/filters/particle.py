@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from torch_ebip import functional
+from torch_ebip.ambient import eager
+from torch_ebip.arguments import as_number
 from torch_ebip.basis.base import Basis
 from torch_ebip.draws import Generators, uniform
 from torch_ebip.filters.members import MemberFilter
@@ -86,13 +88,13 @@ class ParticleFilter(MemberFilter):
         dof_names: tuple[str, ...] | None = None,
     ) -> None:
         super().__init__(dynamics, observation, noise, prior, n_members, n_dofs, dt, thinning, dof_names)
-        if not 0 <= threshold <= 1:
-            raise ValueError(f"threshold must lie between 0 and 1, got {threshold}")
-        if not 0 <= softness < 1:
+        as_number("threshold", threshold, 0, 1)
+        if as_number("softness", softness, 0) >= 1:
             raise ValueError(f"softness must be at least 0 and below 1, got {softness}")
         self.threshold = threshold
         self.softness = softness
 
+    @eager
     def initial_state(
         self,
         batch_shape: tuple[int, ...] = (),

@@ -23,7 +23,7 @@ class _Range(NamedTuple):
 
     family: int
     weights: Tensor  # view of the members, [..., k, F, E]
-    centre: Tensor  # to which they are deviations, [..., k, F]
+    centre: Tensor | None  # to which they are deviations, [..., k, F]; None where it is 0
     terms: Tensor  # buffer of the same shape
     projections: Tensor  # [..., k, E], view of the plan's
 
@@ -83,7 +83,8 @@ class Plan:
             buffer = terms[: weights.numel()].view(weights.shape)
             family = families.index(basis.bases[rows[first]])
             middle = centre[..., part].reshape(*batch, last - first, -1)
-            self._ranges.append(_Range(family, weights, middle, buffer, self.projections[..., first:last, :]))
+            somewhere = middle if bool(middle.any()) else None
+            self._ranges.append(_Range(family, weights, somewhere, buffer, self.projections[..., first:last, :]))
 
     def project(self, phase: Tensor) -> Tensor:
         """h(x) [..., K, E] of members at phases [..., E]: the plan's buffer, overwritten next time."""
@@ -97,7 +98,8 @@ class Plan:
                 features[family] = functions.by_function(phase) if inside else functions(phase).transpose(-1, -2)
             torch.mul(weights, features[family].unsqueeze(-3), out=terms)
             torch.sum(terms, -2, out=projections)
-            self._add_product(projections, centre, features[family])
+            if centre is not None:
+                self._add_product(projections, centre, features[family])
         return self.projections
 
     def measurement_noise(self, deviations: Callable[[], tuple[Tensor, bool]]) -> tuple[Tensor, Tensor]:

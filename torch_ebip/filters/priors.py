@@ -7,6 +7,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
+from torch_ebip.ambient import owned
+from torch_ebip.arguments import as_number
 from torch_ebip.draws import Generators, integers, standard_normal
 
 
@@ -22,7 +24,7 @@ class DemonstrationPrior(nn.Module):
     def __init__(self, states: Tensor) -> None:
         super().__init__()
         check_states(states)
-        self.register_buffer("states", states)
+        self.register_buffer("states", owned(states))
 
     def forward(
         self,
@@ -77,9 +79,8 @@ class MomentPrior(nn.Module):
     def __init__(self, states: Tensor, shrinkage: float = 0.0) -> None:
         super().__init__()
         check_states(states)
-        if not 0 <= shrinkage <= 1:
-            raise ValueError(f"shrinkage must lie between 0 and 1, got {shrinkage}")
-        self.register_buffer("states", states)
+        as_number("shrinkage", shrinkage, 0, 1)
+        self.register_buffer("states", owned(states))
         self.shrinkage = shrinkage
 
     def forward(self, batch_shape: tuple[int, ...], members: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -109,6 +110,10 @@ class MomentPrior(nn.Module):
             return mean.expand(*batch_shape, -1), covariance.expand(*batch_shape, -1, -1)
         return mean, covariance
 
+    def extra_repr(self) -> str:
+        """The option."""
+        return f"shrinkage={self.shrinkage:g}"
+
     def select(self, columns: Tensor) -> MomentPrior:
         """The prior of some entries of the state, int64 [k]."""
         return MomentPrior(self.states[:, columns], self.shrinkage)
@@ -122,6 +127,8 @@ def check_states(states: Tensor) -> None:
 
 def check_members(members: Tensor, count: int) -> None:
     """ValueError unless members are int64 [..., E], indices of ``count`` demonstrations."""
+    if not isinstance(members, Tensor):
+        raise ValueError(f"members must be a tensor, int64 [..., E], got {type(members).__name__}")
     if members.dtype != torch.int64 or members.ndim < 1:
         raise ValueError(f"members must be int64 [..., E], got {members.dtype} {tuple(members.shape)}")
     if members.numel() and (int(members.min()) < 0 or int(members.max()) >= count):
@@ -150,8 +157,8 @@ class GaussianPrior(nn.Module):
 
     def __init__(self, mean: Tensor, covariance: Tensor) -> None:
         super().__init__()
-        self.register_buffer("mean", mean)
-        self.register_buffer("cholesky", torch.linalg.cholesky(covariance))
+        self.register_buffer("mean", owned(mean))
+        self.register_buffer("cholesky", owned(torch.linalg.cholesky(covariance)))
 
     def forward(
         self,

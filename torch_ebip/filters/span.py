@@ -33,7 +33,9 @@ class SpanMembers:
         self._place = torch.empty(n - 2, dtype=torch.long, device=start.device)
         self._place[seen] = torch.arange(len(seen), device=start.device)
         self._place[rest] = len(seen) + torch.arange(len(rest), device=start.device)
-        last = torch.eye(E).to(start).expand(*start.shape[:-2], E, E) if self._transformed else start[..., 2 + rest]
+        last = start[..., 2 + rest]
+        if self._transformed:
+            last = torch.eye(E, dtype=start.dtype, device=start.device).expand(*start.shape[:-2], E, E)
         first = start[..., torch.cat([torch.arange(2, device=start.device), 2 + seen])]
         self.matrix = torch.cat([first, last], dim=-1).transpose(-1, -2).contiguous()
 

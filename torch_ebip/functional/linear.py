@@ -6,6 +6,24 @@ import torch
 from torch import Tensor
 
 
+def truth(condition: Tensor, instead: str) -> bool:
+    """Whether a condition holds, for code that must know.
+
+    Args:
+        condition: bool [] or [1].
+        instead: what to do without vmap.
+
+    Raises:
+        RuntimeError: under `torch.vmap`, where nobody can know.
+    """
+    try:
+        return bool(condition)
+    except RuntimeError as error:
+        if "vmap" not in str(error):
+            raise
+        raise RuntimeError(f"torch.vmap cannot look at values; {instead}") from None
+
+
 class FactorisationError(ValueError):
     """A covariance of observations that is not positive definite.
 
@@ -31,7 +49,7 @@ def cholesky(matrix: Tensor, rows: Tensor | None = None) -> Tensor:
     """
     factor: Tensor
     factor, info = torch.linalg.cholesky_ex(matrix)
-    if bool(info.any()):
+    if truth(info.any(), "updates take batches themselves: give them leading dimensions instead"):
         entries = info.nonzero().tolist() if info.ndim else []
         minors = sorted(set(info[info > 0].reshape(-1).tolist()))
         dofs = [m - 1 if rows is None else int(rows[m - 1]) for m in minors]

@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from torch_ebip.ambient import without_autocast
+
 
 class Centred(NamedTuple):
     """Members taken apart; their mean is ``reference + shift``.
@@ -33,6 +35,7 @@ def centred(members: Tensor, weights: Tensor | None = None) -> Centred:
     return Centred(shifted - shift.unsqueeze(-2), reference.squeeze(-2), shift)
 
 
+@without_autocast
 def ensemble_mean(members: Tensor, weights: Tensor | None = None) -> Tensor:
     """Mean [..., n] of members [..., E, n] with weights [..., E] that sum to 1; default: equal ones."""
     reference = members[..., :1, :].detach()
@@ -41,6 +44,7 @@ def ensemble_mean(members: Tensor, weights: Tensor | None = None) -> Tensor:
     return reference.squeeze(-2) + shift
 
 
+@without_autocast
 def ensemble_variance(members: Tensor, weights: Tensor | None = None, unbiased: bool = True) -> Tensor:
     """Variance [..., n] of members [..., E, n] with weights [..., E]; default: equal ones.
 
@@ -50,6 +54,7 @@ def ensemble_variance(members: Tensor, weights: Tensor | None = None, unbiased: 
     return (anomalies.square() * member_shares(members, weights, unbiased)).sum(-2)
 
 
+@without_autocast
 def ensemble_covariance(members: Tensor, weights: Tensor | None = None, unbiased: bool = True) -> Tensor:
     """Covariance [..., n, n] of members [..., E, n] with weights [..., E]; otherwise as `ensemble_variance`."""
     anomalies = centred(members, weights).anomalies

@@ -24,6 +24,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torch_ebip.ambient import without_autocast
 from torch_ebip.functional.linear import add_product, cholesky
 from torch_ebip.functional.moments import centred as taken_apart
 from torch_ebip.functional.moments import member_shares
@@ -54,6 +55,7 @@ class _Innovation(NamedTuple):
     observed: Tensor | None  # bool [..., D]; None for all
 
 
+@without_autocast
 def ensemble_update(
     members: Tensor,
     projections: Tensor,
@@ -105,6 +107,7 @@ def ensemble_update(
     return updated, _log_likelihood(innovation)
 
 
+@without_autocast
 def square_root_update(
     members: Tensor,
     projections: Tensor,

@@ -11,6 +11,8 @@ from abc import ABC, abstractmethod
 import torch
 from torch import Tensor, nn
 
+from torch_ebip.ambient import owned
+
 
 class Constrained(nn.Module, ABC):
     """A learnable value with a starting point and a constraint.
@@ -29,8 +31,8 @@ class Constrained(nn.Module, ABC):
     def __init__(self, start: Tensor) -> None:
         super().__init__()
         self._check(start)
-        self.register_buffer("start", start.detach().clone())
-        self.raw = nn.Parameter(torch.zeros_like(start))
+        self.register_buffer("start", owned(start))
+        self.raw = nn.Parameter(owned(torch.zeros_like(start)))
 
     @staticmethod
     @abstractmethod
@@ -55,9 +57,13 @@ class Positive(Constrained):
         super().__init__(start)
         self.floor = floor
 
+    def extra_repr(self) -> str:
+        """Shape and floor."""
+        return f"{list(self.start.shape)}, floor={self.floor:g}"
+
     @staticmethod
     def _check(start: Tensor) -> None:
-        if not bool((start > 0).all()):
+        if not bool(((start > 0) & start.isfinite()).all()):
             raise ValueError(f"a positive parameter must start above 0, got {start.min():.3g}")
 
     @property
@@ -80,7 +86,7 @@ class AboveOne(Constrained):
 
     @staticmethod
     def _check(start: Tensor) -> None:
-        if not bool((start > 1).all()):
+        if not bool(((start > 1) & start.isfinite()).all()):
             raise ValueError(f"an inflation that is learned must start above 1, got {start}")
 
     @property

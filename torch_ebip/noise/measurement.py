@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
+from torch_ebip.ambient import owned
 from torch_ebip.basis.base import Basis
 from torch_ebip.noise.constraints import Positive
 
@@ -28,7 +29,7 @@ class MeasurementNoise(nn.Module):
 
     def __init__(self, variance: Tensor, context: Basis | None = None, modality_of_dof: Tensor | None = None) -> None:
         super().__init__()
-        if variance.ndim != 1 or not bool((variance > 0).all()):
+        if variance.ndim != 1 or not bool(((variance > 0) & variance.isfinite()).all()):
             raise ValueError(f"variance must be positive, [D], got {tuple(variance.shape)}, min {variance.min()}")
         self.variance = Positive(variance)
         self.context = context
@@ -36,9 +37,9 @@ class MeasurementNoise(nn.Module):
         if context is not None:
             if modality_of_dof is None or modality_of_dof.shape != variance.shape:
                 raise ValueError(f"a context needs modality_of_dof, int64 [{len(variance)}]")
-            self.register_buffer("modality_of_dof", modality_of_dof)
+            self.register_buffer("modality_of_dof", owned(modality_of_dof))
             groups = int(modality_of_dof.max()) + 1
-            self.gates = nn.Parameter(variance.new_zeros(context.n_features, groups))
+            self.gates = nn.Parameter(owned(variance.new_zeros(context.n_features, groups)))
 
     @property
     def depends_on_phase(self) -> bool:
@@ -74,7 +75,7 @@ class SelectedNoise(nn.Module):
     def __init__(self, whole: nn.Module, dofs: Tensor) -> None:
         super().__init__()
         self.whole = whole
-        self.register_buffer("dofs", dofs)
+        self.register_buffer("dofs", owned(dofs))
 
     @property
     def depends_on_phase(self) -> bool:

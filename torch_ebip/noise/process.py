@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from torch_ebip.ambient import owned
 from torch_ebip.draws import Generators, standard_normal
 from torch_ebip.noise.constraints import Positive
 
@@ -68,8 +69,8 @@ class WeightNoise(nn.Module):
     def __init__(self, rates: Tensor, deviation: Tensor, modality_of_weight: Tensor) -> None:
         super().__init__()
         self.rates = Positive(rates)
-        self.register_buffer("deviation", deviation)
-        self.register_buffer("modality_of_weight", modality_of_weight)
+        self.register_buffer("deviation", owned(deviation))
+        self.register_buffer("modality_of_weight", owned(modality_of_weight))
 
     def scale(self, dt: Tensor) -> Tensor:
         """Standard deviation of the step of each weight, [..., n_weights] for dt [...] seconds."""
@@ -103,7 +104,7 @@ class InteractionNoise(nn.Module):
         self.thinning = thinning
         self.phase = phase
         self.weights = weights
-        self.register_buffer("columns", columns)
+        self.register_buffer("columns", None if columns is None else owned(columns))
 
     def select(self, columns: Tensor, thinning: int = 1) -> InteractionNoise:
         """The same noise, with the same parameters, for a state with some of the weights.

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torch_ebip.arguments import as_number
 from torch_ebip.noise.constraints import Positive
 
 FAR = 1e5
@@ -51,7 +52,7 @@ class RobustWeights(nn.Module, ABC):
 
     def __init__(self, scale: float) -> None:
         super().__init__()
-        self.scale = Positive(torch.tensor(float(scale)))
+        self.scale = Positive(torch.tensor(as_number("scale", scale), device="cpu"))
 
     @abstractmethod
     def inverse(self, z: Tensor) -> Tensor:
@@ -77,6 +78,10 @@ class RobustWeights(nn.Module, ABC):
         inverse = torch.where(far, 1 / LEAST, inverse)
         wider = ((noise + variance * (inverse - 1)) / thinning).sqrt()
         return Trusted(torch.where(far, mean, y), wider, 1 / inverse)
+
+    def meant(self) -> str:
+        """What its tensors mean, see `Meaning`: where it starts is one of them."""
+        return ""
 
     def extra_repr(self) -> str:
         """Where the weights begin to fall."""

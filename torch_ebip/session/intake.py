@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -171,13 +172,15 @@ class Intake:
         M = len(self.columns)
         return Freshness(self._nothing.copy(), np.zeros(M, np.int64), np.full(M, -1, np.int64), np.zeros(M, np.int64))
 
-    def usable(self, tick: int, freshness: Freshness, patience: float) -> tuple[Array, npt.NDArray[np.bool_]]:
+    def usable(
+        self, tick: int, freshness: Freshness, patience: Sequence[float]
+    ) -> tuple[Array, npt.NDArray[np.bool_]]:
         """What a tick measured, [D], and what of it, bool [D], comes from sensors that are not frozen.
 
         Args:
             tick: to look at, one after the other.
             freshness: so far; brought up to date.
-            patience: seconds for which a sensor may say the same.
+            patience: [M] seconds for which each sensor may say the same.
         """
         values = self.at(tick)
         usable = ~np.isnan(values)
@@ -189,7 +192,7 @@ class Intake:
             if not common.any() or (said[common] != before[common]).any():
                 freshness.since[m] = tick
             before[usable[columns]] = said[usable[columns]]
-            if (tick - freshness.since[m]) * self.dt > patience:
+            if (tick - freshness.since[m]) * self.dt > patience[m]:
                 freshness.frozen[m] += 1
                 usable[columns] = False
             else:

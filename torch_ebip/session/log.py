@@ -11,6 +11,7 @@ import json
 import os
 import warnings
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -37,8 +38,18 @@ class SessionLog:
     def __init__(self, path: str | os.PathLike[str], header: Mapping[str, Any]) -> None:
         self.path = Path(path)
         first = json.dumps({"kind": KIND, "format": FORMAT, **header}) + "\n"
-        self._file: IO[str] | None = self.path.open("x", encoding="utf-8", buffering=1)
-        self._file.write(first)
+        file = self.path.open("x", encoding="utf-8", buffering=1)
+        try:
+            file.write(first)
+            file.flush()
+        except OSError as error:
+            with suppress(OSError):  # what could not be written cannot be flushed either
+                file.close()
+            self.path.unlink(missing_ok=True)
+            if error.filename is None:
+                error.filename = str(self.path)  # a full disk does not say which file it refused
+            raise
+        self._file: IO[str] | None = file
 
     @property
     def open(self) -> bool:

@@ -16,7 +16,11 @@ from torch_ebip.session.session import InteractionSession, SessionForecast, fing
 from torch_ebip.session.settings import SessionSettings
 
 MOST_TICKS = 2000
-"""Of a window: the session keeps a state of the filter for each."""
+"""Of a window, and of a gap."""
+MOST_MEMORY = 1 << 28
+"""Bytes of the states that a window keeps, one a tick."""
+TICKS_A_LINE = 100
+"""To be filtered, on the average, beside `MOST_TICKS` at the start: late samples have their window filtered again."""
 MOST_HORIZONS = 10_000
 """Of one forecast."""
 
@@ -61,14 +65,20 @@ def replay(path: str | os.PathLike[str], filter: Filter, primitive: InteractionP
         if set(header["settings"]) != known:
             raise ValueError(f"expected {', '.join(sorted(known))}, got {str(header['settings'])[:200]}")
         settings = SessionSettings(**header["settings"])
-        if max(settings.window, settings.longest_gap / 50) > MOST_TICKS * filter.dt:
-            raise ValueError(f"a window of more than {MOST_TICKS} ticks, or a gap of more than 50 times as many")
+        if max(settings.window, settings.longest_gap) > MOST_TICKS * filter.dt:
+            raise ValueError(f"a window or a gap of more than {MOST_TICKS} ticks")
+        state = filter.initial_state(generator=torch.Generator("cpu").manual_seed(0))
+        size = state[0].numel() * state[0].element_size() * settings.window / filter.dt
+        if size > MOST_MEMORY:
+            raise ValueError(f"a window whose states take {size:.0f} bytes, expected at most {MOST_MEMORY}")
         session = InteractionSession(filter, primitive, header["sensors"], settings)
     except (KeyError, TypeError, ValueError, OverflowError, RuntimeError, MemoryError) as error:
         raise ValueError(f"{path}: the settings of the session are damaged: {error}") from error
     forecasts, recorded = [], []
-    for entry in entries:
+    for line, entry in enumerate(entries, 2):
         try:
+            if session.ticks_filtered > MOST_TICKS + TICKS_A_LINE * line:
+                raise ValueError(f"{session.ticks_filtered} ticks to filter already, for {line} lines")
             if entry[0] == "push":
                 session.push(entry[1], entry[3], entry[2])
             elif entry[0] == "advance":
@@ -77,7 +87,7 @@ def replay(path: str | os.PathLike[str], filter: Filter, primitive: InteractionP
                 if isinstance(entry[2], list) and len(entry[2]) > MOST_HORIZONS:
                     raise ValueError(f"more than {MOST_HORIZONS} horizons")
                 forecasts.append(session.forecast(entry[2], entry[1]))
-                recorded.append(torch.tensor(entry[3], dtype=next(filter.parameters()).dtype))
+                recorded.append(torch.tensor(entry[3], dtype=next(filter.parameters()).dtype, device="cpu"))
         except (TypeError, ValueError, OverflowError, RuntimeError, MemoryError) as error:
             raise ValueError(f"{path}: damaged: {str(entry)[:80]}: {error}") from error
     return Replay(session, forecasts, recorded)

@@ -13,7 +13,7 @@ import hashlib
 import math
 import os
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from types import TracebackType
 from typing import Any, NamedTuple
@@ -22,12 +22,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torch_ebip.ambient import in_own_modes
 from torch_ebip.filters import Filter
 from torch_ebip.primitive import InteractionPrimitive
 from torch_ebip.session.engine import make_engine
 from torch_ebip.session.intake import Freshness, Intake, SensorReport, as_number, as_vector, training_ranges
 from torch_ebip.session.log import SessionLog
-from torch_ebip.session.settings import SessionSettings
+from torch_ebip.session.settings import FROZEN_AFTER, SessionSettings
 
 TOLERANCE = 1e-3
 """Ticks by which a time may be short of a tick and still be it: clocks that count from 1970 round to microseconds."""
@@ -68,10 +69,11 @@ class InteractionSession:
 
     Raises:
         ValueError: a sensor that the layout does not have, that is controlled or named twice; no controlled DoF; a
-            filter of other DoFs.
+            filter of other DoFs, in another order, or at another rate.
         FileExistsError, OSError: the recording cannot be written.
     """
 
+    @in_own_modes
     def __init__(
         self,
         filter: Filter,
@@ -83,6 +85,12 @@ class InteractionSession:
         layout = primitive.layout
         if filter.n_dofs != layout.n_dofs:
             raise ValueError(f"the filter has {filter.n_dofs} DoFs, the primitive's layout {layout.n_dofs}")
+        if filter.dof_names is not None and filter.dof_names != layout.dofs:
+            pairs = zip(filter.dof_names, layout.dofs, strict=True)
+            first = next((ours, theirs) for ours, theirs in pairs if ours != theirs)
+            raise ValueError(f"the filter and the primitive have other columns: {first[0]!r} and {first[1]!r}")
+        if abs(filter.dt * primitive.rate - 1) > 1e-6:
+            raise ValueError(f"the filter takes {1 / filter.dt:g} samples a second, the primitive {primitive.rate:g}")
         if not bool(layout.controlled.any()):
             raise ValueError(f"nothing to forecast: no modality of {', '.join(layout.names)} is controlled")
         if sensors is None:
@@ -97,6 +105,7 @@ class InteractionSession:
         self.settings = settings = SessionSettings() if settings is None else settings
         self.sensors, self.dt = tuple(sensors), filter.dt
         self.dofs = tuple(dof for dof, ours in zip(layout.dofs, layout.controlled.tolist(), strict=True) if ours)
+        self._patience = _patience(settings.frozen_after, primitive, self.sensors)
         self._numbers = {name: i for i, name in enumerate(self.sensors)}
         # A sample may belong to a tick half a tick before it was taken.
         behind = math.floor(settings.window / self.dt + 0.5 + TOLERANCE) + 1
@@ -113,7 +122,7 @@ class InteractionSession:
         self._like = next(filter.parameters())
         self._freshness = [self._intake.fresh() for _ in range(self._slots)]
         self._engine.save(-1 % self._slots)
-        self._head, self._dirty = -1, 0
+        self._head, self._dirty, self._ticks = -1, 0, 0
         self._now = self._newest = settings.start
         self._lock = threading.RLock()
         self._log: SessionLog | None = None
@@ -150,6 +159,7 @@ class InteractionSession:
             if tick is not None:
                 self._dirty = min(self._dirty, tick)
 
+    @in_own_modes
     def advance(self, now: float | None = None) -> None:
         """Filter up to the present.
 
@@ -165,6 +175,7 @@ class InteractionSession:
             if self._log is not None:
                 self._log.write(["advance", now])
 
+    @in_own_modes
     def forecast(self, horizon: float | Sequence[float] | None = None, now: float | None = None) -> SessionForecast:
         """Filter up to the present, and say what the controlled DoFs should be.
 
@@ -203,6 +214,12 @@ class InteractionSession:
         """How many ticks were left out because the filter could not take them in."""
         with self._lock:
             return self._current().failed
+
+    @property
+    def ticks_filtered(self) -> int:
+        """How many ticks the filter was led through so far, those that late samples made it repeat included."""
+        with self._lock:
+            return self._ticks
 
     def report(self) -> dict[str, SensorReport]:
         """What became of everything that was pushed, by sensor."""
@@ -259,9 +276,10 @@ class InteractionSession:
         """One more tick."""
         freshness = self._current().copy()
         self._head += 1
+        self._ticks += 1
         if self._head > 0:
             self._engine.predict()
-        values, usable = self._intake.usable(self._head, freshness, self.settings.frozen_after)
+        values, usable = self._intake.usable(self._head, freshness, self._patience)
         if usable.any():
             y = torch.as_tensor(values, dtype=self._like.dtype, device=self._like.device)
             try:
@@ -277,6 +295,22 @@ class InteractionSession:
                     self._engine.predict()
         self._freshness[self._head % self._slots] = freshness
         self._engine.save(self._head % self._slots)
+
+
+def _patience(
+    frozen_after: float | Mapping[str, float] | None, primitive: InteractionPrimitive, sensors: Sequence[str]
+) -> list[float]:
+    """Seconds for which each sensor may repeat itself; see `SessionSettings`."""
+    repeats = dict(zip(primitive.layout.names, primitive.longest_repeat.tolist(), strict=True))
+    usual = {name: max(FROZEN_AFTER, 1.5 * repeats[name]) for name in sensors}
+    if frozen_after is None:
+        return list(usual.values())
+    if not isinstance(frozen_after, Mapping):
+        return [frozen_after] * len(sensors)
+    strangers = [name for name in frozen_after if name not in usual]
+    if strangers:
+        raise ValueError(f"frozen_after names {', '.join(strangers)}; the sensors are {', '.join(sensors)}")
+    return [frozen_after.get(name, usual[name]) for name in sensors]
 
 
 def _plain(now: float | None) -> float | None:

@@ -3,7 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import Any
+
+from torch_ebip.arguments import as_count, as_number
+
+FROZEN_AFTER = 0.25
+"""Seconds: a sensor whose demonstrations never repeat themselves is frozen then."""
 
 
 @dataclass(frozen=True)
@@ -17,7 +24,9 @@ class SessionSettings:
             replay; forecasts go on from the last tick at the speed of the interaction.
         margin: how far outside the range of the demonstrations a value may lie, in widths of that range. Nothing else
             protects the filter from values that are finite and absurd.
-        frozen_after: for how long a sensor may repeat itself to the last digit before it is taken for frozen.
+        frozen_after: for how long a sensor may repeat itself to the last digit before it is taken for frozen: one
+            number for all of them, or by name (infinity: it never is). Default: a quarter of a second, or half as
+            long again as it ever did in the demonstrations, whichever is more; a switch may say the same for long.
         stale_after: without anything usable for how long a sensor is reported stale.
         longest_gap: by how much the present, or a sample, may be ahead of what was filtered last.
         seed: of all draws.
@@ -30,7 +39,7 @@ class SessionSettings:
     window: float = 0.25
     settle: float = 0.0
     margin: float = 1.0
-    frozen_after: float = 0.25
+    frozen_after: float | Mapping[str, float] | None = None
     stale_after: float = 0.1
     longest_gap: float = 10.0
     seed: int = 0
@@ -38,11 +47,25 @@ class SessionSettings:
     def __post_init__(self) -> None:
         """Checks, and makes plain numbers of those of other libraries."""
         for field in fields(self):
-            kind = int if field.name == "seed" else float
-            object.__setattr__(self, field.name, kind(getattr(self, field.name)))
-        for name in ("window", "frozen_after", "stale_after", "longest_gap"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be a positive number of seconds, got {getattr(self, name)}")
+            value = getattr(self, field.name)
+            if field.name == "seed":
+                value = as_count("seed", value, -(2**63))
+            elif isinstance(value, Mapping):
+                value = {
+                    str(sensor): _real(f"{field.name} of {sensor!r}", number) for sensor, number in value.items()
+                }
+            elif value is not None:
+                value = _real(field.name, value)
+            object.__setattr__(self, field.name, value)
+        positive = {name: getattr(self, name) for name in ("window", "stale_after", "longest_gap")}
+        frozen = self.frozen_after
+        if isinstance(frozen, Mapping):
+            positive |= {f"frozen_after of {sensor!r}": number for sensor, number in frozen.items()}
+        elif frozen is not None:
+            positive["frozen_after"] = frozen
+        for name, number in positive.items():
+            if number is None or not number > 0:
+                raise ValueError(f"{name} must be a positive number of seconds, got {number}")
         for name in ("start", "window", "longest_gap"):
             if not math.isfinite(getattr(self, name)):
                 raise ValueError(f"{name} must be finite, got {getattr(self, name)}")
@@ -52,3 +75,13 @@ class SessionSettings:
             raise ValueError(
                 f"settle must be at least 0 and less than the window of {self.window} s, got {self.settle}"
             )
+
+
+def _real(name: str, value: Any) -> float:
+    """A plain number of whatever library, which may be infinite; NaN is caught where its range is."""
+    try:
+        return as_number(name, value)
+    except ValueError:
+        if isinstance(value, float) or getattr(value, "ndim", None) == 0:
+            return float(value)
+        raise

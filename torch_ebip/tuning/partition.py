@@ -26,10 +26,10 @@ class Partition:
         held = max(1, round(settings.validation * count))
         if settings.folds < 2 or count - held < 1 or count < 2 * settings.folds:
             raise ValueError(f"{count} demonstrations are too few for {settings.folds} folds and validation")
-        order = torch.randperm(count, generator=torch.Generator().manual_seed(settings.seed))
+        order = torch.randperm(count, generator=torch.Generator("cpu").manual_seed(settings.seed), device="cpu")
         self.validating, self.training = order[:held], order[held:]
-        part = torch.empty(count, dtype=torch.long)
-        part[order] = torch.arange(count) % settings.folds
+        part = torch.empty(count, dtype=torch.long, device="cpu")
+        part[order] = torch.arange(count, device="cpu") % settings.folds
         others = [(part != fold).nonzero().squeeze(-1) for fold in range(settings.folds)]
         size = min(len(group) for group in others)
         self._part, self._others = part, torch.stack([group[:size] for group in others])
@@ -41,5 +41,7 @@ class Partition:
         if size is None or size == others.shape[1]:
             return others
         if size > others.shape[1]:
-            return others.gather(1, torch.randint(others.shape[1], (len(others), size), generator=generator))
-        return others.gather(1, torch.rand(others.shape, generator=generator).argsort(-1)[:, :size])
+            return others.gather(
+                1, torch.randint(others.shape[1], (len(others), size), generator=generator, device="cpu")
+            )
+        return others.gather(1, torch.rand(others.shape, generator=generator, device="cpu").argsort(-1)[:, :size])

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from torch_ebip.arguments import as_count, as_number
+
 
 @dataclass(frozen=True)
 class TuningSettings:
@@ -49,8 +51,16 @@ class TuningSettings:
     def __post_init__(self) -> None:
         """ValueError for a setting outside its range."""
         for name in ("steps", "batch_size", "horizons_each", "validate_every", "patience", "thinning"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+            as_count(name, getattr(self, name))
+        for name, least in {"folds": 2, "segment": 0, "seed": -(2**63)}.items():
+            as_count(name, getattr(self, name), least)
+        if self.n_members is not None:
+            as_count("n_members", self.n_members, 2)
+        for name in ("learning_rate", "clip"):
+            as_number(name, getattr(self, name), 0, above=True)
+        as_number("pull", self.pull, 0)
+        if isinstance(self.only, str) or not all(isinstance(pattern, str) for pattern in self.only):
+            raise ValueError(f"only must be a sequence of patterns, got {self.only!r}")
         low, high = self.horizons
         if not 0 < low <= high <= 1:
             raise ValueError(f"horizons must be 0 < low <= high <= 1, got {self.horizons}")

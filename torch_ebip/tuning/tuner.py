@@ -19,6 +19,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from torch_ebip.ambient import own_modes, without_autocast
+from torch_ebip.arguments import as_mask
 from torch_ebip.checkpoint import load_checkpoint, save_checkpoint
 from torch_ebip.demonstrations import Demonstrations
 from torch_ebip.draws import seeded
@@ -51,9 +53,9 @@ class Tuner:
             numbers of measurements, if the objective has an innovation term).
 
     Raises:
-        ValueError: demonstrations that are not the prior's; fewer than two folds or too few demonstrations for
-            them; no parameter matches ``only``; a checkpoint of another configuration; more processes than
-            interactions a step or kept for validation.
+        ValueError: demonstrations that are not the prior's, or on another layout; targets other than the objective's;
+            fewer than two folds or too few demonstrations for them; no parameter matches ``only``; a checkpoint of
+            another configuration; more processes than interactions a step or kept for validation.
     """
 
     def __init__(
@@ -72,14 +74,25 @@ class Tuner:
     ) -> None:
         if len(primitive) != len(demonstrations):
             raise ValueError(f"{len(demonstrations)} demonstrations, but the primitive has {len(primitive)}")
+        if demonstrations.layout != primitive.layout or abs(demonstrations.rate / primitive.rate - 1) > 1e-6:
+            raise ValueError("the demonstrations have another layout or rate than the primitive")
+        if filter.dof_names is not None and filter.dof_names != primitive.layout.dofs:
+            raise ValueError("the filter has other columns than the primitive, or in another order")
         states = getattr(filter.prior, "states", None)
         if states is None or not torch.equal(states[:, 2:], primitive.weights):
             raise ValueError("the filter's prior does not hold the demonstrations of this primitive")
         self.filter, self.primitive, self.objective = filter, primitive, objective
         self.settings = TuningSettings() if settings is None else settings
         device = primitive.weights.device
-        self.targets = targets.to(device)
-        self.subsets = {name: subset.to(device) for name, subset in subsets.items()}
+        self.targets = as_mask("targets", targets, primitive.layout.n_dofs).to(device)
+        if self.targets.tolist() != [dof in objective.names for dof in primitive.layout.dofs]:
+            raise ValueError(f"the objective scores {', '.join(objective.names)}, which are not the targets")
+        if not subsets:
+            raise ValueError("subsets must be at least one set of sensors that are shown together")
+        self.subsets = {
+            name: as_mask(f"subset {name!r}", subset, primitive.layout.n_dofs).to(device)
+            for name, subset in subsets.items()
+        }
         self.monitor, self.progress = monitor, progress
         self.ranks = Ranks() if ranks is None else ranks
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
@@ -101,12 +114,18 @@ class Tuner:
 
     def run(self) -> TuningResult:
         """Tune, and leave the parameters of the best validation in the filter."""
+        with own_modes(), torch.inference_mode(False), torch.enable_grad():
+            return self._run()
+
+    def _run(self) -> TuningResult:
         settings, began = self.settings, time.monotonic()
         optimizer = torch.optim.Adam(self.parameters.values(), lr=settings.learning_rate)
         history: dict[int, float] = {}
         best, start = self._snapshot(), 0
         if self.checkpoint is not None and self.checkpoint.exists():
             start, best, history = self._resume(optimizer)
+        if self.monitor is not None:
+            self.monitor.resume(start if history else -1)
         if not history:
             history[0] = self._validate(0)
         waited = _waited(history)
@@ -162,11 +181,13 @@ class Tuner:
 
     def _step(self, step: int, optimizer: torch.optim.Optimizer) -> float:
         settings, began = self.settings, time.monotonic()
-        generator = torch.Generator().manual_seed(_mix(settings.seed, step))
-        picked = torch.randperm(len(self.partition.training), generator=generator)[: settings.batch_size]
-        name = list(self.subsets)[int(torch.randint(len(self.subsets), (), generator=generator))]
+        generator = torch.Generator("cpu").manual_seed(_mix(settings.seed, step))
+        picked = torch.randperm(len(self.partition.training), generator=generator, device="cpu")[
+            : settings.batch_size
+        ]
+        name = list(self.subsets)[int(torch.randint(len(self.subsets), (), generator=generator, device="cpu"))]
         low, high = settings.horizons
-        draws = torch.rand(len(picked), settings.horizons_each, generator=generator)
+        draws = torch.rand(len(picked), settings.horizons_each, generator=generator, device="cpu")
         picked = self.partition.training[picked]
         members = self.partition.members(picked, generator)
         part, trace, context = self._filter(picked, self.subsets[name], low + (high - low) * draws, members, step)
@@ -196,6 +217,7 @@ class Tuner:
             self.monitor.scalars(scalars, step)
         return total
 
+    @without_autocast
     @torch.no_grad()
     def evaluate(self, interactions: Tensor | None = None, shares: Tensor | None = None) -> dict[str, float]:
         """Scores of the filter as it is, always at the same horizons and draws; nothing is reported or changed.
@@ -211,13 +233,13 @@ class Tuner:
         """
         interactions = self.partition.validating if interactions is None else interactions
         low, high = self.settings.horizons
-        shares = low + (high - low) * (torch.arange(4) + 0.5) / 4 if shares is None else shares
+        shares = low + (high - low) * (torch.arange(4, device="cpu") + 0.5) / 4 if shares is None else shares
         if self.ranks.size > len(interactions):
             raise ValueError(f"{self.ranks.size} processes, but only {len(interactions)} interactions to share")
         totals: dict[str, list[float]] = {}
         for name, subset in self.subsets.items():
             members = self.partition.members(
-                interactions, torch.Generator().manual_seed(_mix(self.settings.seed, -1))
+                interactions, torch.Generator("cpu").manual_seed(_mix(self.settings.seed, -1))
             )
             every = shares.expand(len(interactions), -1)
             part, trace, context = self._filter(interactions, subset, every, members, -1)
