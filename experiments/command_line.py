@@ -1,17 +1,25 @@
-"""What the commands of all experiments have in common: where a run goes, and what it starts from."""
+"""What the commands of all experiments have in common: how they end, where a run goes, what it starts from."""
 
 from __future__ import annotations
 
 import argparse
+import io
+import os
+import sys
 from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import nullcontext
 from functools import wraps
+
+from experiments.interrupts import interruptible
 
 GOES_ON = "what is finished is kept: a run that resumes goes on with the same --out"
 
 
 def command(main: Callable[[list[str] | None], None]) -> Callable[[list[str] | None], None]:
-    """A main function that says in a line what ends it without being its fault: a disk, a process that died.
+    """A main function that says in a line what ends it without being its fault: Ctrl-C, a disk, a process that died.
+
+    What a terminal cannot show it shows as it can.
 
     Raises:
         SystemExit: then.
@@ -20,8 +28,13 @@ def command(main: Callable[[list[str] | None], None]) -> Callable[[list[str] | N
     @wraps(main)
     def run(arguments: list[str] | None = None) -> None:
         """See the function itself."""
+        for stream in (sys.stdout, sys.stderr):
+            if isinstance(stream, io.TextIOWrapper):
+                stream.reconfigure(errors="replace")
+        alone = arguments is None and "TORCHELASTIC_RUN_ID" not in os.environ  # torchrun ends its processes itself
         try:
-            main(arguments)
+            with interruptible() if alone else nullcontext():
+                main(arguments)
         except BrokenProcessPool as error:
             raise SystemExit(
                 f"one of the processes of this run died, perhaps for lack of memory; {GOES_ON}"

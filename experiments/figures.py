@@ -18,6 +18,9 @@ from torch_ebip.layout import Layout
 from torch_ebip.metrics import Z95
 from torch_ebip.noise import MeasurementNoise
 
+matplotlib.rcParams["text.parse_math"] = False
+"""Names of DoFs may have dollars in them, which are no formulas."""
+
 COLOURS = {
     "mean": "0.7",
     "nearest": "0.45",

@@ -6,8 +6,9 @@ import math
 import multiprocessing
 import os
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import closing
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,11 +18,13 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from experiments.interrupts import deaf_children, end_children
 from experiments.results import Cell, Values
 from experiments.run_folder import read_json, write_json
 from torch_ebip.ranks import Ranks
 
 Job = TypeVar("Job")
+Result = TypeVar("Result")
 LOST = "this run was ended, probably because one of its processes died; --out {} goes on, with any number of them"
 """What a process says that cannot go on alone."""
 
@@ -90,19 +93,39 @@ def run_folds(
         shares = ranks.gather(mine)
         return merge([shares[i % ranks.size][i // ranks.size] for i in range(len(jobs))])
     parts: list[Values] = [{} for _ in jobs]
+    with (
+        tqdm(total=len(jobs), desc="folds", unit="fold", dynamic_ncols=True) as bar,
+        closing(in_processes(run, jobs, workers)) as finished,
+    ):
+        for i, part in finished:
+            parts[i] = part
+            bar.set_postfix_str(headline(merge([part for part in parts if part])), refresh=False)
+            bar.update()
+    return merge(parts)
+
+
+def in_processes(run: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -> Iterator[tuple[int, Result]]:
+    """The number and the result of each job as it is finished, in processes that end with this one.
+
+    Args:
+        run: one job; a function of a module, so that a new process can import it.
+        jobs: what can be sent to a process.
+        workers: processes.
+    """
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context, initializer=end_with_parent) as pool:
-        futures = {pool.submit(run, job): i for i, job in enumerate(jobs)}
-        with tqdm(total=len(jobs), desc="folds", unit="fold", dynamic_ncols=True) as bar:
-            try:
-                for future in as_completed(futures):
-                    parts[futures[future]] = future.result()
-                    bar.set_postfix_str(headline(merge([part for part in parts if part])), refresh=False)
-                    bar.update()
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
-    return merge(parts)
+        with deaf_children():
+            futures = {pool.submit(run, job): i for i, job in enumerate(jobs)}
+        try:
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        except Exception:
+            pool.shutdown(cancel_futures=True)
+            raise
+        except BaseException:  # an interrupt waits for none of them
+            pool.shutdown(wait=False, cancel_futures=True)
+            end_children()
+            raise
 
 
 def merge(parts: Sequence[Values]) -> Values:

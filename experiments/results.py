@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
-from scipy.stats import mannwhitneyu
 
 
 class Cell(NamedTuple):
@@ -42,6 +42,8 @@ def summarise(values: Values, reference: str | None = None) -> dict[str, Any]:
             error = float(array.std(ddof=1) / math.sqrt(len(array))) if len(array) > 1 else None
             statistics = {"mean": float(array.mean()), "standard_error": error, "n": len(array)}
             rows.append({"method": name, **key, "unit": cell.unit, **statistics})
+        from scipy.stats import mannwhitneyu  # half a second that no process without a table should wait for
+
         against = reference
         if against is None and measured:
             against = min(measured, key=lambda name: _badness(cell.metric, float(measured[name].mean())))
@@ -164,22 +166,27 @@ def print_tables(
     if not console.is_terminal:
         console.width = max(console.width, 160)
     for grid in grids(results, only):
-        table = Table(title=grid.title.replace("[", "\\["), title_justify="left")
+        table = Table(title=escape(grid.title), title_justify="left")
         table.add_column("method")
         for subset, observed in grid.columns:
-            table.add_column(f"{subset}\n{observed:.0%}", justify="right")
+            table.add_column(escape(f"{subset}\n{observed:.0%}"), justify="right")
         table.add_column("mean of\ncells", justify="right")
         for method, cells in grid.lines.items():
-            table.add_row(method, *(f"[bold]{text}[/bold]" if best else text for text, best in cells))
+            table.add_row(escape(method), *(f"[bold]{text}[/bold]" if best else text for text, best in cells))
         console.print(table)
-    console.print(legend(results))
+    console.print(legend(results), markup=False)
+
+
+def _cell(text: str) -> str:
+    """Text of a cell of a table in Markdown."""
+    return text.replace("|", "\\|")
 
 
 def markdown(results: Mapping[str, Any]) -> str:
     """Every table of the results in Markdown."""
     parts = []
     for grid in grids(results):
-        heads = ["method", *(f"{subset} {observed:.0%}" for subset, observed in grid.columns), "mean"]
+        heads = ["method", *(_cell(f"{subset} {observed:.0%}") for subset, observed in grid.columns), "mean"]
         lines = [f"**{grid.title}**", "", f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}"]
         for method, cells in grid.lines.items():
             texts = (f"**{text}**" if best else text.replace("*", "\\*") for text, best in cells)

@@ -7,6 +7,7 @@ import math
 import os
 import platform
 import secrets
+import shlex
 import shutil
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from experiments.interrupts import advise
 from torch_ebip.files import atomic_write, read_text
 
 if TYPE_CHECKING:
@@ -63,6 +65,7 @@ class RunFolder:
                 if not force:
                     self._check(stored["settings"], asked)
                     self._resume(stored, now)
+                    self._advise(experiment, now)
                     return
                 # At once out of the way: half a folder would be neither a run nor empty.
                 removed = self.path.with_name(f".{self.path.name}.{secrets.token_hex(4)}.removed")
@@ -70,8 +73,14 @@ class RunFolder:
                 shutil.rmtree(removed)
             self._run = now
             write_json(config, now)
+            self._advise(experiment, now)
         except OSError as error:
             raise SystemExit(f"{self.path} cannot be written: {error}") from error
+
+    def _advise(self, experiment: str, now: Mapping[str, Any]) -> None:
+        """What an interrupt says."""
+        again = shlex.join(["python", "-m", f"experiments.{experiment}", *now["arguments"], "--out", str(self.path)])
+        advise(f"what is finished is kept, and the rest is done by\n  {again}")
 
     def _resume(self, stored: dict[str, Any], now: Mapping[str, Any]) -> None:
         """Go on with a run; what was half-written when it was killed goes, and what differs from then is noted."""

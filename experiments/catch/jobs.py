@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -25,7 +24,7 @@ from experiments.catch.controllers import (
 from experiments.catch.learning import filters, know
 from experiments.catch.throws import CONDITIONS, Toss, draw
 from experiments.catch.trial import Drop, Outcome, run
-from experiments.folds import end_with_parent
+from experiments.folds import in_processes
 from experiments.run_folder import read_json, write_json
 from torch_ebip import Filter, InteractionPrimitive
 
@@ -145,24 +144,16 @@ def run_all(plan: Plan, methods: Sequence[str], workers: int) -> Results:
         for condition in CONDITIONS
     ]
     done: dict[Portion, list[dict[str, Any]]] = {}
-    context = multiprocessing.get_context("spawn")
+    total = plan.throws * len(methods) * len(CONDITIONS)
     with (
-        ProcessPoolExecutor(workers, mp_context=context, initializer=end_with_parent) as pool,
-        tqdm(
-            total=plan.throws * len(methods) * len(CONDITIONS), desc="throws", unit="throw", dynamic_ncols=True
-        ) as bar,
+        tqdm(total=total, desc="throws", unit="throw", dynamic_ncols=True) as bar,
+        closing(in_processes(run_portion, portions, workers)) as finished,
     ):
-        futures = {pool.submit(run_portion, portion): portion for portion in portions}
-        try:
-            for future in as_completed(futures):
-                portion = futures[future]
-                done[portion] = future.result()
-                rates = ", ".join(f"{method} {_rate(done, method):.0%}" for method in methods[:3])
-                bar.set_postfix_str(f"caught: {rates}", refresh=False)
-                bar.update(portion.last - portion.first)
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+        for i, rows in finished:
+            done[portions[i]] = rows
+            rates = ", ".join(f"{method} {_rate(done, method):.0%}" for method in methods[:3])
+            bar.set_postfix_str(f"caught: {rates}", refresh=False)
+            bar.update(len(rows))
     results: Results = {(method, condition): [] for method in methods for condition in CONDITIONS}
     for portion in portions:
         results[portion.method, portion.condition] += done[portion]

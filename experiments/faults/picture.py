@@ -11,6 +11,8 @@ import numpy as np
 matplotlib.use("Agg")
 from matplotlib.figure import Figure
 
+matplotlib.rcParams["text.parse_math"] = False
+
 GROUPS = {
     "without": "never there",
     "lost": "lost at",

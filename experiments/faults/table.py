@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 from scipy.stats import bootstrap
 
@@ -143,15 +144,15 @@ def print_table(results: Mapping[str, Any]) -> None:
     console = Console()
     if not console.is_terminal:
         console.width = max(console.width, 180)
-    table = Table(title=_title(results).replace("[", "\\["), title_justify="left")
+    table = Table(title=escape(_title(results)), title_justify="left")
     for head in heads:
-        table.add_column(head, justify="left" if head == "fault" else "right")
+        table.add_column(escape(head), justify="left" if head == "fault" else "right")
     groups = [fault["group"] for fault in results["faults"]]
     for i, line in enumerate(body):
-        table.add_row(*line, end_section=i + 1 < len(groups) and groups[i + 1] != groups[i])
+        table.add_row(*map(escape, line), end_section=i + 1 < len(groups) and groups[i + 1] != groups[i])
     console.print(table)
     for line in verdicts(results):
-        console.print(line)
+        console.print(line, markup=False)
 
 
 def verdicts(results: Mapping[str, Any]) -> list[str]:

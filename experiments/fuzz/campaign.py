@@ -9,8 +9,10 @@ import stat
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import islice
 from pathlib import Path
+from random import Random
 from typing import Any
 
 from experiments.fuzz.kinds import Kind
@@ -48,8 +50,16 @@ def mutations(kind: Kind, folder: Path, size: int, seed: int, rounds: int, quick
     yield from cuts(size, 8 if quick else CUTS)
     yield from flips(rounds, seed)
     yield from splices(rounds, seed)
+    for i in range(rounds):  # every other one is valid, and must be read
+        random, valid = Random(f"{kind.name} {seed} {i}"), i % 2 == 0
+        change = partial(_generated, kind, random, valid)
+        yield Mutation(f"generated {i}, {'valid' if valid else 'with one thing wrong'}", change, valid=valid)
     # In a quick campaign every fifth, which ones the seed says.
     yield from islice(kind.planted(folder, seed, rounds, quick), seed % 5 if quick else 0, None, 5 if quick else 1)
+
+
+def _generated(kind: Kind, random: Random, valid: bool, path: Path) -> None:
+    kind.generate(random, path, valid)
 
 
 def run_kind(

@@ -9,13 +9,15 @@ from dataclasses import dataclass
 from functools import cache, partial
 from importlib import resources
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import numpy as np
 import torch
 
 from experiments.folds import read_values, write_values
-from experiments.fuzz import planted_archives, planted_texts
+from experiments.fuzz import generators, planted_archives, planted_texts
+from experiments.fuzz.generators import Generator
 from experiments.fuzz.mutations import Mutation
 from experiments.fuzz.worker import Reader
 from experiments.methods import Start, keep, restore, tunable
@@ -39,6 +41,7 @@ class Kind:
         make: writes valid files into a folder.
         read: reads them, raises AssertionError if what was read is not valid, returns what stands for the content.
         planted: changes that only this kind can take, given a folder whose file ``canary`` must never appear.
+        generate: makes a file of any shape; see `generators`.
         word: of a refusal that has no path to name.
         exact: whether the format notices blind damage.
     """
@@ -48,6 +51,7 @@ class Kind:
     make: Callable[[Path], None]
     read: Reader
     planted: Callable[[Path, int, int, bool], Iterator[Mutation]]
+    generate: Generator
     word: str | None = None
     exact: bool = False
 
@@ -155,6 +159,10 @@ def _make_session(folder: Path) -> None:
                 session.advance(k / 30)
 
 
+def _generate_session(random: Random, path: Path, valid: bool) -> None:
+    generators.session(random, path, valid, ebip(primitive()), primitive())
+
+
 def _read_session(folder: Path) -> Any:
     lived = replay(folder / "session.jsonl", ebip(primitive()), primitive())
     assert all(bool(forecast.mean.isfinite().all()) for forecast in lived.forecasts)
@@ -177,6 +185,18 @@ def _make_filter(folder: Path) -> None:
     write_json(folder / "report.json", {"start": start._asdict(), "factor_scaled": 100.0})
 
 
+def _generate_filter(random: Random, path: Path, valid: bool) -> None:
+    """A tuned filter with any parameters, beside a report that fits."""
+    start = Start(10 ** random.uniform(-3, 3), 10 ** random.uniform(-1, 2))
+    tuned = tunable(primitive(), start)
+    with torch.no_grad():
+        for parameter in tuned.parameters():
+            parameter.uniform_(-2, 2, generator=torch.Generator().manual_seed(random.getrandbits(32)))
+    keep(path.parent, start, tuned)
+    told = start._asdict() if valid else Start(start.factor * 2, start.sharpness)._asdict()
+    write_json(path.parent / "report.json", {"start": told, "factor_scaled": 100.0})
+
+
 def _read_filter(folder: Path) -> Any:
     restored = restore(folder, primitive())
     assert all(bool(parameter.isfinite().all()) for parameter in restored.parameters())
@@ -191,24 +211,52 @@ KINDS: dict[str, Kind] = {
             lambda folder: demonstrations().save(folder / "recordings.npz"),
             _read_npz,
             planted_archives.recordings,
+            generators.recordings,
             exact=True,
         ),
-        Kind("csv", "b.csv", partial(_make_folder, "layout.toml"), _read_folder, planted_texts.table),
-        Kind("toml", "layout.toml", partial(_make_folder, "layout.toml"), _read_folder, planted_texts.toml),
-        Kind("json", "layout.json", partial(_make_folder, "layout.json"), _read_folder, planted_texts.json_layout),
-        Kind("urdf", "arm.urdf", _make_arm, _read_arm, planted_texts.urdf, word="urdf"),
+        Kind(
+            "csv", "b.csv", partial(_make_folder, "layout.toml"), _read_folder, planted_texts.table, generators.table
+        ),
+        Kind(
+            "toml",
+            "layout.toml",
+            partial(_make_folder, "layout.toml"),
+            _read_folder,
+            planted_texts.toml,
+            generators.toml_layout,
+        ),
+        Kind(
+            "json",
+            "layout.json",
+            partial(_make_folder, "layout.json"),
+            _read_folder,
+            planted_texts.json_layout,
+            generators.json_layout,
+        ),
+        Kind("urdf", "arm.urdf", _make_arm, _read_arm, planted_texts.urdf, generators.urdf, word="urdf"),
         Kind(
             "checkpoint",
             "checkpoint.pt",
             _make_checkpoint,
             _read_checkpoint,
             planted_archives.checkpoint,
+            partial(generators.checkpoint, configuration=CONFIGURATION),
             exact=True,
         ),
-        Kind("session", "session.jsonl", _make_session, _read_session, planted_texts.session),
-        Kind("fold values", "values.json", _make_values, _read_values, planted_texts.run_json),
-        Kind("run report", "report.json", _make_filter, _read_filter, planted_texts.run_json),
-        Kind("tuned filter", "filter.pt", _make_filter, _read_filter, planted_archives.checkpoint, exact=True),
+        Kind("session", "session.jsonl", _make_session, _read_session, planted_texts.session, _generate_session),
+        Kind(
+            "fold values", "values.json", _make_values, _read_values, planted_texts.run_json, generators.fold_values
+        ),
+        Kind("run report", "report.json", _make_filter, _read_filter, planted_texts.run_json, generators.run_report),
+        Kind(
+            "tuned filter",
+            "filter.pt",
+            _make_filter,
+            _read_filter,
+            planted_archives.checkpoint,
+            _generate_filter,
+            exact=True,
+        ),
     )
 }
 """By name."""
