@@ -74,7 +74,7 @@ def load_checkpoint(
         raise
     except Exception as error:  # damaged bytes raise nearly anything, a lack of memory included
         reason = str(error).rpartition("WeightsUnpickler error:")[2].strip()[:300]
-        if "weights_only" in reason or not reason:  # torch's advice to load it unsafely
+        if not reason or any(word in reason for word in ("weights_only", "safe_globals", "trust")):  # torch's advice
             reason = "it holds something else than tensors, numbers, strings and containers of them"
         raise ValueError(
             f"{path}: not a readable checkpoint (cut off, damaged or of another kind): {reason}"

@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -36,7 +37,7 @@ class Demonstrations:
     def __init__(
         self,
         layout: Layout,
-        trajectories: Sequence[Tensor],
+        trajectories: Sequence[Tensor | npt.ArrayLike],
         rate: float,
         columns: Mapping[str, Array] | None = None,
     ) -> None:
@@ -151,10 +152,10 @@ class Demonstrations:
             raise ValueError(f"{path}: {error}") from error
 
 
-def _checked(index: int, trajectory: Tensor, layout: Layout) -> Tensor:
+def _checked(index: int, given: Tensor | npt.ArrayLike, layout: Layout) -> Tensor:
     name = f"demonstration {index}"
     with own_modes(inference=True):
-        trajectory = outside_inference(as_values(name, trajectory, layout.dofs).detach())
+        trajectory = outside_inference(as_values(name, given, layout.dofs).detach())
     if trajectory.ndim != 2 or trajectory.shape[1] != layout.n_dofs:
         raise ValueError(
             f"{name} has shape {tuple(trajectory.shape)}, expected [T, {layout.n_dofs}]: one column for each of "

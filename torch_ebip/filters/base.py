@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor, nn
@@ -22,8 +23,11 @@ from torch_ebip.functional.linear import truth
 from torch_ebip.meaning import Meaning
 from torch_ebip.noise.pair import FilterNoise
 
+Phases: TypeAlias = Tensor | Sequence[float] | float
+"""Of a forecast."""
 
-def as_phases(phase: Tensor | float, like: Tensor) -> Tensor:
+
+def as_phases(phase: Phases, like: Tensor) -> Tensor:
     """Phases [P] or [..., P] of a forecast, in the dtype and on the device of ``like``; one number is [1].
 
     Raises:
@@ -130,12 +134,12 @@ class Filter(Meaning, ABC):
         """[...], mean phase; NaN where the observation has no phase."""
 
     @abstractmethod
-    def forecast(self, state: State, phase: Tensor | None = None) -> Forecast:
+    def forecast(self, state: State, phase: Phases | None = None) -> Forecast:
         """The trajectory that the state implies.
 
         Args:
             state: of this filter.
-            phase: [P] or [..., P]; default: 50 phases evenly from the current one to 1.
+            phase: [P] or [..., P], or one number; default: 50 phases evenly from the current one to 1.
         """
 
     @abstractmethod

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch_ebip.ambient import eager
 from torch_ebip.basis.base import Basis
 from torch_ebip.draws import Generators
-from torch_ebip.filters.base import Filter, as_phases
+from torch_ebip.filters.base import Filter, Phases, as_phases
 from torch_ebip.filters.forecast import Forecast
 from torch_ebip.filters.interaction import BasisProjection, ConstantVelocityPhase
 from torch_ebip.filters.model import demonstration_states, interaction_model
@@ -176,7 +176,7 @@ class ExtendedFilter(Filter):
         return state.mean[..., 0]
 
     @eager
-    def forecast(self, state: GaussianState, phase: Tensor | None = None) -> Forecast:
+    def forecast(self, state: GaussianState, phase: Phases | None = None) -> Forecast:
         """h(phi, mu) and Phi(phi) Sigma_ww Phi(phi)' at phases to come; see `Filter.forecast`."""
         basis = self._observation.basis
         phase = self._phases_ahead(state) if phase is None else as_phases(phase, state.mean)

@@ -21,6 +21,7 @@ from torch import Tensor
 from torch_ebip.ambient import in_own_modes
 from torch_ebip.arguments import as_mask, as_number, as_values
 from torch_ebip.draws import Generators, is_several, set_states, standard_normal, states_of
+from torch_ebip.filters.base import Phases
 from torch_ebip.filters.evidence import Evidence
 from torch_ebip.filters.forecast import Forecast
 from torch_ebip.filters.interaction import BasisProjection, ConstantVelocityPhase
@@ -185,7 +186,7 @@ class LiveFilter:
 
     @in_own_modes
     @torch.no_grad()
-    def forecast(self, phase: Tensor | None = None, dofs: Tensor | None = None) -> Forecast:
+    def forecast(self, phase: Phases | None = None, dofs: Tensor | None = None) -> Forecast:
         """See `Filter.forecast`; of some dofs only, bool [D], if given, which costs less than all."""
         D = self.filter.n_dofs
         chosen = (True,) * D if dofs is None else tuple(as_mask("dofs", dofs, D).tolist())

@@ -12,7 +12,7 @@ from torch_ebip import functional
 from torch_ebip.ambient import eager
 from torch_ebip.arguments import as_count
 from torch_ebip.draws import Generators
-from torch_ebip.filters.base import Filter, as_phases
+from torch_ebip.filters.base import Filter, Phases, as_phases
 from torch_ebip.filters.evidence import Evidence
 from torch_ebip.filters.forecast import Forecast
 from torch_ebip.filters.interaction import BasisProjection, ConstantVelocityPhase
@@ -159,7 +159,7 @@ class MemberFilter(Filter):
         return project_at(members, phase), None if centre is None else project_at(centre.unsqueeze(-2), phase)
 
     @eager
-    def forecast(self, state: State, phase: Tensor | None = None) -> Forecast:
+    def forecast(self, state: State, phase: Phases | None = None) -> Forecast:
         """Steps 4 and 5 of the paper's box: mean and variance over members of h at phases to come.
 
         At a given phase h is linear in the weights, so the mean of h is h of the mean, the paper's output.
