@@ -15,9 +15,9 @@ from torch_ebip import Demonstrations, Layout, Modality
 
 ROOT = Path(__file__).parents[2]
 ODD = [
-    Modality("ha$nd^{", ["$\\frac{1", "hand_{y}"], "m$"),
+    Modality("ha$nd^{$", ["$\\frac{1$", "hand_{y}"], "$m^$"),
     Modality("[red]gaze[/red]|", ["_gaze"], "rad²"),
-    Modality("Ärm", ["arm|1", "[bold]arm"], "%s{}", controlled=True),
+    Modality("Ärm", ["$\\arm{$|1", "[bold]arm"], "%s{}", controlled=True),
 ]
 
 
