@@ -9,7 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.figures import colour
+from experiments.figures import colour, plain
 from experiments.results import Values
 
 
@@ -25,11 +25,12 @@ def error_figure(values: Values, panels: Sequence[tuple[str, str]]) -> Figure:
             axis.plot(at, [np.nanmean(array) for array in arrays], color=colour(name), label=name)
             axis.fill_between(at, low, high, color=colour(name), alpha=0.15, lw=0)
         axis.set_xlabel("observed share of the interaction")
-        axis.set_ylabel(f"{metric} of the end of {modality} [{cells[0].unit}]")
+        axis.set_ylabel(plain(f"{metric} of the end of {modality} [{cells[0].unit}]"))
         axis.set_ylim(bottom=0)
         axis.grid(alpha=0.3)
     axes[0, 0].legend(fontsize=8)
-    figure.suptitle(f"observed: {cells[0].subset}; band: 10 to 90 % of the held-out interactions", fontsize=9)
+    observed = plain(cells[0].subset)
+    figure.suptitle(f"observed: {observed}; band: 10 to 90 % of the held-out interactions", fontsize=9)
     return figure
 
 
@@ -49,7 +50,7 @@ def calibration_figure(reports: Mapping[str, Mapping[str, Any]], modality: str) 
         axis.set_xlabel("predicted probability of less")
         axis.set_ylim(0, 1.05 * top)
         curve.plot(report["nominal"], report["empirical"], "o-", ms=3, color=colour(name), label=name)
-    axes[0, 0].set_ylabel(f"share of the ends of {modality}")
+    axes[0, 0].set_ylabel(plain(f"share of the ends of {modality}"))
     curve.set_xlabel("nominal coverage")
     curve.set_ylabel("empirical coverage")
     curve.legend(fontsize=8)

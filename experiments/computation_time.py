@@ -25,7 +25,7 @@ from experiments.command_line import add_data_options, add_run_options, command,
 from experiments.data import load, thinning
 from experiments.entries import METHODS, Fold
 from experiments.evaluate import FilterMethod, evaluate
-from experiments.figures import colour
+from experiments.figures import colour, plain
 from experiments.folds import mean_of_cells, split
 from experiments.methods import FACTORS, best_factor, scaled
 from experiments.run_folder import RunFolder, save_figure
@@ -94,7 +94,7 @@ def figure(by_length: Sequence[Mapping[str, Any]], by_members: Sequence[Mapping[
     rows = [row for row in by_members if row["method"] == by_members[0]["method"]]
     times.plot([r["members"] for r in rows], [1e3 * r["seconds_per_sample"] for r in rows], "s--", ms=4, color="0.4")
     below.set_xlabel("ensemble members E")
-    below.set_ylabel(f"error after {FRACTION:.0%} [{unit}]")
+    below.set_ylabel(plain(f"error after {FRACTION:.0%} [{unit}]"))
     below.set_ylim(bottom=0)
     times.set_ylabel("time a sample [ms] (dashed)")
     times.set_ylim(bottom=0)

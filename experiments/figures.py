@@ -18,9 +18,6 @@ from torch_ebip.layout import Layout
 from torch_ebip.metrics import Z95
 from torch_ebip.noise import MeasurementNoise
 
-matplotlib.rcParams["text.parse_math"] = False
-"""Names of DoFs may have dollars in them, which are no formulas."""
-
 COLOURS = {
     "mean": "0.7",
     "nearest": "0.45",
@@ -36,6 +33,11 @@ COLOURS = {
     "ebip_scaled": "tab:orange",
     "ebip_tuned": "tab:blue",
 }
+
+
+def plain(text: str) -> str:
+    """Text as it is: names may have dollars in them, which are no formulas, and begin with what legends leave out."""
+    return ("\u200a" if text.startswith("_") else "") + text.replace("$", r"\$")
 
 
 def colour(method: str) -> str:
@@ -63,9 +65,9 @@ def results_figure(results: Mapping[str, Any], panels: Sequence[tuple[str, str |
             means = [row["mean"] for row in mine]
             drawn = axis.errorbar(at, means, errors, fmt="o", ms=4, capsize=2, color=colour(method), label=method)
             handles.setdefault(method, drawn)
-        axis.set_xticks(range(len(cells)), [_label(*cell) for cell in cells], fontsize=8)
+        axis.set_xticks(range(len(cells)), [plain(_label(*cell)) for cell in cells], fontsize=8)
         unit = "" if rows[0]["unit"] == "1" else f" [{rows[0]['unit']}]"
-        axis.set_ylabel(f"{metric}{'' if modality is None else ' ' + modality}{unit}", fontsize=9)
+        axis.set_ylabel(plain(f"{metric}{'' if modality is None else ' ' + modality}{unit}"), fontsize=9)
         axis.grid(axis="y", alpha=0.3)
         if metric == "coverage_95":
             axis.axhline(0.95, color="0.3", lw=0.8, ls="--")
@@ -119,7 +121,8 @@ def forecast_figure(
             truth = trajectory[:, layout.dofs.index(dof)]
             axis.plot(torch.linspace(0, 1, last + 1), truth, color="black", lw=1, ls="--", label="truth")
             axis.axvline(now / last, color="0.5", lw=0.8)
-            axis.set_ylabel(f"{dof} [{layout.units[layout.dofs.index(dof)]}]" if column == 0 else "", fontsize=9)
+            unit = layout.units[layout.dofs.index(dof)]
+            axis.set_ylabel(plain(f"{dof} [{unit}]") if column == 0 else "", fontsize=9)
             axis.grid(alpha=0.3)
         axes[0, column].set_title(f"{fraction:.0%} observed", fontsize=10)
         axes[-1, column].set_xlabel("phase")
@@ -139,7 +142,7 @@ def noise_figure(filter: Filter, closed_form: Tensor, layout: Layout, shown: Seq
     for name in shown:
         part = layout.slice(name)
         ratio = (variance[:, part] / closed_form[part]).log().mean(-1).exp()
-        axis.semilogy(phases, ratio, label=name)
+        axis.semilogy(phases, ratio, label=plain(name))
     axis.set_xlabel("phase")
     axis.set_ylabel("R / closed-form R")
     axis.grid(alpha=0.3, which="both")

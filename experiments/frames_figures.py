@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from scipy.stats import gaussian_kde
 from torch import Tensor
 
-from experiments.figures import colour
+from experiments.figures import colour, plain
 from torch_ebip import Filter, Forecast
 from torch_ebip.layout import Layout
 
@@ -59,7 +59,7 @@ def frames_figure(name: str, filter: Filter, trajectory: Tensor, layout: Layout,
         density.fill_between(values, _density(forecast, here, values), color="tab:blue", alpha=0.4, lw=0)
         density.axvline(float(truth[-1]), color="tab:green", ls="--", lw=1)
         density.set_title(f"{(now + 1) / (last + 1):.0%} observed", fontsize=9)
-        density.set_xlabel(f"{dof} at the end [{unit}]", fontsize=8)
+        density.set_xlabel(plain(f"{dof} at the end [{unit}]"), fontsize=8)
         for past in range(PAST):
             path.plot(
                 phase, forecast.mean[here - PAST + past, :, 0], color="tab:red", lw=0.6, alpha=0.2 + 0.06 * past
@@ -69,8 +69,8 @@ def frames_figure(name: str, filter: Filter, trajectory: Tensor, layout: Layout,
         path.axvline(now / last, color="0.5", lw=0.8)
         path.set_xlabel("phase", fontsize=8)
         path.grid(alpha=0.3)
-    axes[0, 0].set_ylabel(f"density [1/{unit}]")
-    axes[1, 0].set_ylabel(f"{dof} [{unit}]")
+    axes[0, 0].set_ylabel(plain(f"density [1/{unit}]"))
+    axes[1, 0].set_ylabel(plain(f"{dof} [{unit}]"))
     axes[1, 0].plot([], [], color="tab:red", lw=0.6, label=f"last {PAST} predictions")
     axes[1, 0].legend(fontsize=7)
     figure.suptitle(name, fontsize=10)

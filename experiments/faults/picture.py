@@ -7,11 +7,9 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-
-matplotlib.use("Agg")
 from matplotlib.figure import Figure
 
-matplotlib.rcParams["text.parse_math"] = False
+from experiments.figures import plain
 
 GROUPS = {
     "without": "never there",
@@ -51,8 +49,8 @@ def faults_figure(results: Mapping[str, Any], method: str) -> Figure:
     axis.axhline(error["clean"]["mean"], color="black", linewidth=1, label="clean")
     axis.set_yscale("log")
     axis.grid(axis="y", which="both", alpha=0.2)
-    axis.set_xticks(range(len(sensors)), sensors, rotation=20, ha="right")
-    axis.set_ylabel(f"{method}: mean squared error\nof {target} at the end [{error['clean']['unit']}]")
+    axis.set_xticks(range(len(sensors)), [plain(sensor) for sensor in sensors], rotation=20, ha="right")
+    axis.set_ylabel(plain(f"{method}: mean squared error\nof {target} at the end [{error['clean']['unit']}]"))
     axis.legend(fontsize=8, ncols=2)
     axis.spines[["top", "right"]].set_visible(False)
     return figure

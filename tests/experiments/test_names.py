@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from experiments.figures import plain, plt
 from tests.conftest import interactions
 from torch_ebip import Demonstrations, Layout, Modality
 
@@ -58,3 +59,16 @@ def test_without_their_packages_the_studies_say_what_to_install(module: str, tmp
         line = [sys.executable, "-c", "import experiments.results"]
         done = subprocess.run(line, cwd=ROOT, env=environment, check=False, capture_output=True, text=True)
         assert done.stderr.strip().splitlines()[-1] == f"ImportError: {wanted}"
+
+
+def test_pictures_show_names_as_they_are_and_numbers_as_formulas() -> None:
+    figure, axis = plt.subplots()
+    axis.semilogy([1, 2], [3.1, 3.3], label=plain("_gaze"))
+    axis.set_xlabel(plain("a $\\frac{1$ and $"))
+    axis.legend()
+    figure.canvas.draw()
+    assert [text.get_text().strip() for text in axis.get_legend().get_texts()] == ["_gaze"]
+    assert axis.xaxis.label._preprocess_math(axis.xaxis.label.get_text()) == ("a $\\frac{1$ and $", False)
+    assert any("mathdefault" in tick.get_text() for tick in axis.get_yticklabels(which="both"))
+    assert plt.rcParams["text.parse_math"]  # else powers of ten are spelled as TeX
+    plt.close(figure)
