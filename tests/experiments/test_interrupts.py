@@ -16,7 +16,7 @@ from tests.conftest import interactions
 ROOT = Path(__file__).parents[2]
 STUDIES = {
     # Folds in processes of their own: an interrupt reaches all of them at once, as a terminal sends it.
-    "folds": (["compare", "--quick", "--folds", "2", "--methods", "ebip_scaled"], "fold-00"),
+    "folds": (["compare", "--quick", "--folds", "2", "--methods", "ebip"], "fold-00"),
     "alone": (["tune", "--quick", "--steps", "1000"], "scan_scaled.json"),
     "importing": (["tune", "--quick", "--folds", "2"], "config.json"),
 }

@@ -22,7 +22,7 @@ RUN = [
     "2",
     "--methods",
     "ebip",
-    "ebip_scaled",
+    "ridge",
     "--subsets",
     "shoe+imu",
 ]
