@@ -44,8 +44,10 @@ def test_an_interrupt_ends_a_study(study: str, tmp_path: Path) -> None:
     line = [sys.executable, "-m", f"experiments.{name}", "--data", str(tmp_path / "made.npz"), *options]
     with (tmp_path / "said.txt").open("w+") as said:
         started = subprocess.Popen(
-            [*line, "--out", str(out)], cwd=ROOT, start_new_session=True, stdout=said, stderr=subprocess.STDOUT
-        )
+            [*line, "--out", str(out)], cwd=ROOT, start_new_session=True, stdout=said, stderr=subprocess.STDOUT,
+            # Whoever runs the tests in the background of a script has interrupts ignored, which is handed on.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )  # fmt: skip
         try:
             deadline = time.monotonic() + 100
             while not (out / sign).exists() and started.poll() is None and time.monotonic() < deadline:
