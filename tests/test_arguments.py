@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+import torch_ebip
 from tests.conftest import interactions, layout, small_primitive
 from torch_ebip import (
     BSplineBasis,
@@ -23,6 +25,7 @@ from torch_ebip import (
     LiveFilter,
     Modality,
     PolynomialBasis,
+    RobotArm,
     StackedBasis,
     bip,
     ebip,
@@ -34,8 +37,9 @@ from torch_ebip.filters import ConstantVelocityPhase
 from torch_ebip.filters.evidence import EvidenceWeighting
 from torch_ebip.noise import Positive, StudentT
 from torch_ebip.objective import ForecastObjective, Weights
+from torch_ebip.repeats import longest_repeats
 from torch_ebip.session import InteractionSession, SessionSettings
-from torch_ebip.tuning import TuningSettings
+from torch_ebip.tuning import Tuner, TuningSettings
 
 FILTERS: dict[str, Callable[[InteractionPrimitive], Filter]] = {
     "ebip": lambda p: ebip(p, square_root=True),
@@ -282,3 +286,48 @@ def test_masks_and_values_keep_what_they_are() -> None:
     values = as_values("v", source, None)
     source[:] = 0
     assert values.sum() == 4  # memory of its own
+
+
+def test_more_that_is_refused_by_name() -> None:
+    """Lists of booleans live and in arms, columns of another number, joints by name from frames."""
+    live = LiveFilter(ebip(PRIMITIVE))
+    live.update([0.0] * 5, [True, False, True, False, False])
+    made = ebip(PRIMITIVE)
+    parts = (made.dynamics, made.observation, made.noise, made.prior)
+    with pytest.raises(ValueError, match="5 names, one for each DoF, got 2"):
+        type(made)(*parts, 8, 5, 0.1, dof_names=("a", "b"))
+    with pytest.raises(ValueError, match="leaves no function beside the offset"):
+        GaussianBasis(1, offset=True)
+    arm = RobotArm.ur5()
+    joints = np.zeros((2, 6), np.float32)
+    assert torch.equal(arm(joints), arm(torch.zeros(2, 6)))
+    assert torch.equal(arm(Frame(joints, list(arm.joint_names))), arm(torch.zeros(2, 6)))
+    observed = [[True] * 3 + [False] * 2] * 4
+    trace = ebip(PRIMITIVE, square_root=True)(torch.ones(4, 5), observed, generator=torch.Generator().manual_seed(0))
+    assert trace.phase.shape == (4,)
+    with pytest.raises(ValueError, match="horizons must be"):
+        TuningSettings(horizons=(0.9, 0.2))
+    sparse = interactions(4)[0].clone()
+    sparse[:, 2] = math.nan
+    sparse[3, 2] = 1.0
+    assert longest_repeats(Demonstrations(layout(), [sparse], 30.0)).tolist()[1] == 0.0
+    with pytest.raises(ValueError, match="validation must be a share"):
+        TuningSettings(validation=1.0)
+    targets, subsets = layout().controlled, {"a": layout().mask(["hand"])}
+    objective = ForecastObjective(PRIMITIVE, targets)
+    assert "targets=arm.1, arm.2" in repr(objective)
+    with pytest.raises(ValueError, match="5 demonstrations, but the primitive has 24"):
+        Tuner(ebip(PRIMITIVE), interactions(5), PRIMITIVE, objective, targets, subsets)
+    hand, *rest = layout().modalities
+    swapped = Layout([Modality("hand", hand.dofs[::-1], "m"), *rest])
+    moved = InteractionPrimitive.fit(Demonstrations(swapped, list(interactions()), 30.0), PRIMITIVE.basis)
+    with pytest.raises(ValueError, match="the filter has other columns than the primitive"):
+        Tuner(ebip(moved), interactions(), PRIMITIVE, objective, targets, subsets)
+
+
+def test_a_package_that_nobody_installed_has_no_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> str:
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr("importlib.metadata.version", missing)
+    assert torch_ebip.__version__ == "unknown"
