@@ -132,8 +132,9 @@ def test_how_a_filter_runs_is_no_meaning() -> None:
     ):
         state = {name: value for name, value in tuned.state_dict().items() if "prior" not in name}
         other.load_state_dict(state, strict=False)
+        assert torch.equal(other.noise.robust.scale.start, tuned.noise.robust.scale.start)
     ours, theirs = particle_filter(primitive(), softness=0.1), particle_filter(primitive(), softness=0.2)
-    ours.load_state_dict(theirs.state_dict())
+    assert str(ours.load_state_dict(theirs.state_dict())) == "<All keys matched successfully>"
 
 
 def test_a_state_dict_from_before_loads_with_a_warning() -> None:
