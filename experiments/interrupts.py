@@ -25,11 +25,6 @@ def advise(text: str) -> None:
     _state["advice"] = text
 
 
-def advice() -> str:
-    """What was said to `advise` last."""
-    return _state["advice"]
-
-
 def end_children() -> None:
     """End all processes that this one started through multiprocessing, and wait until they are gone."""
     children = multiprocessing.active_children()
