@@ -26,9 +26,9 @@ from experiments.folds import LOST, mean_of_cells, read_values, run_folds, share
 from experiments.paper_table import paper_rows
 from experiments.results import Values, markdown, print_tables, summarise
 from experiments.run_folder import RunFolder, read_json, save_figure, write_json
-from torch_ebip.files import atomic_write
-from torch_ebip.ranks import RankLostError, Ranks
-from torch_ebip.tuning import TuningSettings
+from torch_ebip import TuningSettings
+from torch_ebip.common.files import atomic_write
+from torch_ebip.learning.ranks import RankLostError, Ranks
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,7 @@ from experiments.figures import colour, plain
 from experiments.folds import mean_of_cells, split
 from experiments.methods import FACTORS, best_factor, scaled
 from experiments.run_folder import RunFolder, save_figure
-from torch_ebip import Filter, ebip
-from torch_ebip.tuning import TuningSettings
+from torch_ebip import Filter, TuningSettings, ebip
 
 FRACTION = 0.82
 

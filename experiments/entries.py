@@ -31,13 +31,13 @@ from torch_ebip import (
     Demonstrations,
     Filter,
     InteractionPrimitive,
+    TuningSettings,
     bip,
     ebip,
     ebip_minus,
     particle_filter,
     select_basis,
 )
-from torch_ebip.tuning import TuningSettings
 
 
 @dataclass(frozen=True)

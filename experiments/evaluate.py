@@ -11,10 +11,9 @@ import torch
 from torch import Tensor
 
 from experiments.results import Cell, Values
-from torch_ebip import Demonstrations, Filter, Forecast, InteractionPrimitive
-from torch_ebip import metrics as measure
-from torch_ebip.draws import seeded
-from torch_ebip.kinematics import RobotArm
+from torch_ebip import Demonstrations, Filter, Forecast, InteractionPrimitive, RobotArm
+from torch_ebip.common.draws import seeded
+from torch_ebip.learning import metrics as measure
 
 
 class Task(NamedTuple):

@@ -13,10 +13,8 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from torch_ebip import Demonstrations, Filter
-from torch_ebip.layout import Layout
-from torch_ebip.metrics import Z95
-from torch_ebip.noise import MeasurementNoise
+from torch_ebip import Demonstrations, Filter, Layout, MeasurementNoise
+from torch_ebip.learning.metrics import Z95
 
 COLOURS = {
     "mean": "0.7",
@@ -132,7 +130,7 @@ def forecast_figure(
 
 def noise_figure(filter: Filter, closed_form: Tensor, layout: Layout, shown: Sequence[str]) -> Figure:
     """The learned R relative to the closed form over phase, a line a modality (geometric mean over its DoFs)."""
-    noise = filter.noise.measurement
+    noise = filter.model.measurement_noise
     if not isinstance(noise, MeasurementNoise):
         raise TypeError("the filter's measurement noise is not one that is learned")
     figure, axis = plt.subplots(figsize=(6, 3.5), layout="constrained")

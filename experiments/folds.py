@@ -21,7 +21,7 @@ from tqdm import tqdm
 from experiments.interrupts import deaf_children, end_children
 from experiments.results import Cell, Values
 from experiments.run_folder import read_json, write_json
-from torch_ebip.ranks import Ranks
+from torch_ebip.learning.ranks import Ranks
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")

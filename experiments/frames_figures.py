@@ -12,8 +12,7 @@ from scipy.stats import gaussian_kde
 from torch import Tensor
 
 from experiments.figures import colour, plain
-from torch_ebip import Filter, Forecast
-from torch_ebip.layout import Layout
+from torch_ebip import Filter, Forecast, Layout
 
 FRACTIONS = (0.1, 0.3, 0.43, 0.6, 0.82, 0.95)
 PAST = 10

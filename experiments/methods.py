@@ -13,23 +13,26 @@ from torch import Tensor
 
 from experiments.run_folder import read_json, write_json
 from torch_ebip import (
+    AboveOne,
     BSplineBasis,
     Demonstrations,
     EnsembleFilter,
     Filter,
     InteractionPrimitive,
     ParticleFilter,
+    RobotArm,
+    RobustWeights,
+    Tuner,
+    TuningResult,
+    TuningSettings,
     ebip,
     particle_filter,
 )
-from torch_ebip.checkpoint import load_checkpoint, save_checkpoint
-from torch_ebip.kinematics import RobotArm
-from torch_ebip.losses import ForwardKinematicsLoss
-from torch_ebip.monitor import Monitor
-from torch_ebip.noise import AboveOne, RobustWeights
-from torch_ebip.objective import ForecastObjective, Weights
-from torch_ebip.ranks import Ranks
-from torch_ebip.tuning import Tuner, TuningResult, TuningSettings
+from torch_ebip.learning.checkpoint import load_checkpoint, save_checkpoint
+from torch_ebip.learning.losses import ForwardKinematicsLoss
+from torch_ebip.learning.monitor import Monitor
+from torch_ebip.learning.objective import ForecastObjective, Weights
+from torch_ebip.learning.ranks import Ranks
 
 FACTORS = (1.0, 10.0, 100.0, 1000.0, 10000.0)
 """Coarse grid of factors on the closed-form R; the best one is refined by half-decades."""

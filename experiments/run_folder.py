@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from experiments.interrupts import advise
-from torch_ebip.files import atomic_write, read_text
+from torch_ebip.common.files import atomic_write, read_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

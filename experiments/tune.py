@@ -37,12 +37,11 @@ from experiments.folds import (
 from experiments.methods import FACTORS, Problem, best_factor, best_start, keep, scaled, tunable, tune
 from experiments.results import Values, print_tables, summarise
 from experiments.run_folder import RunFolder, read_json, save_figure, write_json
-from torch_ebip import InteractionPrimitive, select_basis
-from torch_ebip.basis import rank_candidates, selection_table
-from torch_ebip.files import atomic_write
-from torch_ebip.monitor import Monitor
-from torch_ebip.ranks import RankLostError, Ranks
-from torch_ebip.tuning import TuningSettings
+from torch_ebip import InteractionPrimitive, TuningSettings, select_basis
+from torch_ebip.common.files import atomic_write
+from torch_ebip.interaction.basis import rank_candidates, selection_table
+from torch_ebip.learning.monitor import Monitor
+from torch_ebip.learning.ranks import RankLostError, Ranks
 
 
 @dataclass(frozen=True)

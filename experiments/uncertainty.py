@@ -23,8 +23,7 @@ from experiments.folds import split
 from experiments.frames_figures import attribution_figure, frames_figure
 from experiments.results import print_tables, summarise
 from experiments.run_folder import RunFolder, save_figure
-from torch_ebip import Demonstrations, Forecast
-from torch_ebip.tuning import TuningSettings
+from torch_ebip import Demonstrations, Forecast, TuningSettings
 
 NAMES = ("ebip", "ebip_tuned", "particle_filter")
 LEVELS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)

@@ -1,4 +1,4 @@
-"""A small tuning run for tests/test_ranks.py: `torchrun ... tests/ranks_program.py FOLDER [STEP]`.
+"""A small tuning run for tests/learning/test_ranks.py: `torchrun ... tests/ranks_program.py FOLDER [STEP]`.
 
 At STEP the last of the processes is killed. Rank 0 leaves the validation losses and parameters in FOLDER.
 """
@@ -9,10 +9,10 @@ import signal
 import sys
 from pathlib import Path
 
+from tests.learning.test_tuning import filter_and_tuner
 from tests.listening import addresses
-from tests.test_tuning import filter_and_tuner
-from torch_ebip.ranks import RankLostError, Ranks
-from torch_ebip.tuning import TuningSettings
+from torch_ebip import TuningSettings
+from torch_ebip.learning.ranks import RankLostError, Ranks
 
 SETTINGS = TuningSettings(steps=4, batch_size=6, validate_every=2, folds=4, thinning=4, seed=3)
 

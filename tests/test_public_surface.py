@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import difflib
 import inspect
 from typing import Any
@@ -11,7 +12,7 @@ import pytest
 
 import torch_ebip
 from tests.public_surface import COMMAND, REVIEWED, surface
-from torch_ebip.filters import EnsembleState, GaussianState, ParticleState
+from torch_ebip import EnsembleState, GaussianState, ParticleState
 
 # What other people's code calls (the design's section 3): these parameters, by these names and in this order, with
 # these defaults. Further ones may follow if they can be left out.
@@ -51,24 +52,24 @@ CONTRACT = {
     "ForwardKinematicsLoss.forward": "predicted_joints, target_joints",
 }
 FILTER = {
-    "initial_state": "batch_shape=(), members=None, generator=None",
+    "initial_state": "batch_shape=(), demonstrations=None, generator=None",
     "predict": "state, dt, generator=None",
     "update": "state, y, observed=None, generator=None",
     "forward": "y, observed=None, dt, state=None, generator=None",
-    "forecast": "state, phase=None",
 }
 CONTRACT |= {
     f"{kind}.{name}": parameters
-    for kind in ("Filter", "EnsembleFilter", "ExtendedFilter", "ParticleFilter")
+    for kind in ("Filter", "EnsembleFilter", "ExtendedFilter", "ParticleFilter", "InteractionFilter")
     for name, parameters in FILTER.items()
 }
+CONTRACT["InteractionFilter.forecast"] = "state, phase=None"
 PROPERTIES = {
     "Layout": ["dofs", "controlled"],
     "Demonstrations": ["durations"],
     "StackedBasis": ["n_weights"],
+    "InteractionTrace": ["phase"],
 }
 FIELDS = {
-    "Trace": ["state", "phase", "log_likelihood", "projection"],
     "Forecast": ["mean", "variance"],
 }
 
@@ -80,18 +81,18 @@ def test_the_public_names_are_those_that_were_reviewed() -> None:
 
 
 def test_a_change_shows_in_the_listing(monkeypatch: pytest.MonkeyPatch) -> None:
-    def initial_state(self: Any, batch_shape: tuple[int, ...] = (1,)) -> None: ...
+    def forward(self: Any, batch_shape: tuple[int, ...] = (1,)) -> None: ...
 
     before = surface().splitlines()
     monkeypatch.setattr(torch_ebip.Layout, "colour", property(lambda self: "red"), raising=False)
-    monkeypatch.setattr(torch_ebip.ExtendedFilter, "initial_state", initial_state)
+    monkeypatch.setattr(torch_ebip.GaussianPrior, "forward", forward)
     monkeypatch.delattr(torch_ebip.Demonstrations, "pad")
     change = [line for line in difflib.ndiff(before, surface().splitlines()) if line[0] in "+-"]
     assert change == [
+        "-     def forward(batch_shape: tuple[int, ...], n_members: int, chosen: Tensor | None = None, "
+        "generator: Generators = None) -> Tensor",
+        "+     def forward(batch_shape: tuple[int, ...] = (1,)) -> None",
         "-     def pad() -> tuple[Tensor, Tensor]",
-        "-     def initial_state(batch_shape: tuple[int, ...] = (), members: Tensor | None = None, "
-        "generator: Generators = None) -> GaussianState",
-        "+     def initial_state(batch_shape: tuple[int, ...] = (1,)) -> None",
         "+     colour: property -> not said",
     ]
 
@@ -113,6 +114,8 @@ def test_the_designs_attributes_are_there(primitive: torch_ebip.InteractionPrimi
             assert isinstance(inspect.getattr_static(_named(name), attribute), property), (name, attribute)
     for name, fields in FIELDS.items():
         assert list(_named(name)._fields[: len(fields)]) == fields
+    traced = {field.name for field in dataclasses.fields(torch_ebip.Trace)}
+    assert {"state", "states", "log_likelihood", "projection"} <= traced
     for state in (EnsembleState, GaussianState, ParticleState):
         assert hasattr(state, "mean"), state
         assert hasattr(state, "covariance"), state

@@ -20,8 +20,7 @@ from experiments.ball_catching.geometry import RATE, Array
 from experiments.ball_catching.sensors import LAYOUT
 from experiments.ball_catching.teacher import Lesson
 from experiments.ball_catching.thrower import STYLES, Throw
-from torch_ebip import Demonstrations
-from torch_ebip.kinematics import RobotArm
+from torch_ebip import Demonstrations, RobotArm
 
 BATCH = 64
 """Tosses simulated at once. Part of what a seed means."""

@@ -18,7 +18,7 @@ from experiments.ball_catching import geometry
 from experiments.ball_catching.flight import STEP, Flight
 from experiments.ball_catching.geometry import DISTANCE, Array
 from experiments.ball_catching.motion import Motion, Wobble, through
-from torch_ebip.kinematics import RobotArm
+from torch_ebip import RobotArm
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from experiments.benchmark.problem import FUNCTIONS, Problem
-from torch_ebip.filters import LiveFilter
+from torch_ebip import LiveFilter
 
 Draw = Callable[..., Tensor]
 """Standard-normal draws of a shape."""
@@ -46,10 +46,11 @@ class Constants:
         self.dt = filter.dt
         with torch.no_grad():
             self.start = filter.prior.states.clone()
-            self.factor = filter.noise.process.phase_factor(self.start.new_tensor(self.dt))
-            self.deviation = filter.noise.measurement()[problem.sensors]
+            self.factor = filter.model.process_noise.factor(self.start.new_tensor(self.dt))
+            self.deviation = filter.model.measurement_noise()[problem.sensors]
         self.sensors = len(self.deviation)
-        self.overrun, self.margin = filter.dynamics.overrun, filter.observation.basis.bases[0].margin
+        model = filter.model
+        self.overrun, self.margin = model.dynamics.overrun, model.measurement.basis.bases[0].margin
 
 
 class Live:

@@ -13,8 +13,7 @@ from experiments.ball_catching.geometry import DISTANCE, GRAVITY, TABLE_HEIGHT, 
 from experiments.ball_catching.scene import Limits, Posture, Reach, travel_time
 from experiments.ball_catching.teacher import LOWEST
 from experiments.catch.throws import OUTSTRETCHED
-from torch_ebip import Filter, InteractionPrimitive
-from torch_ebip.session import InteractionSession, SessionSettings
+from torch_ebip import Filter, InteractionPrimitive, InteractionSession, SessionSettings
 
 SETTLE = 0.02
 """s for which a session waits for the sensors of a moment, a little more than the slowest takes."""

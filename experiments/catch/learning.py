@@ -8,8 +8,7 @@ from pathlib import Path
 from experiments import methods
 from experiments.data import load, thinning
 from experiments.methods import Problem, restore, scaled
-from torch_ebip import Filter, InteractionPrimitive, ebip, particle_filter, select_basis
-from torch_ebip.tuning import TuningSettings
+from torch_ebip import Filter, InteractionPrimitive, TuningSettings, ebip, particle_filter, select_basis
 
 MEMBERS = 80
 """Of an ensemble at work (the paper, section V)."""

@@ -16,7 +16,7 @@ from experiments.catch.controllers import SessionController
 from experiments.catch.jobs import Bench, Plan, Results, bench
 from experiments.catch.throws import Toss
 from experiments.catch.trial import run
-from torch_ebip.files import atomic_write
+from torch_ebip.common.files import atomic_write
 
 STRIDE = 3
 """Control cycles from one frame of the animation to the next."""

@@ -25,7 +25,7 @@ from experiments.faults.table import markdown, print_table, summarise
 from experiments.folds import run_folds, share_cores
 from experiments.results import Values
 from experiments.run_folder import RunFolder, save_figure
-from torch_ebip.files import atomic_write
+from torch_ebip.common.files import atomic_write
 
 DEFAULT = ("ebip_tuned", "tuned_student", "ebip", "ebip_student", "particle_filter", "bip")
 STARTS = (0.2, 0.43, 0.6)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torch_ebip import Demonstrations, Layout
-from torch_ebip.draws import seeded
+from torch_ebip.common.draws import seeded
 
 Damage = Callable[[Tensor, "Wear"], Tensor]
 """From a trajectory [T, D] to what sensors say of it."""

@@ -20,14 +20,16 @@ from experiments.results import Cell, Values
 from torch_ebip import (
     Demonstrations,
     Filter,
+    Gate,
+    Huber,
     InteractionPrimitive,
+    StudentT,
+    TuningSettings,
     bip,
     ebip,
     particle_filter,
     select_basis,
 )
-from torch_ebip.noise import Gate, Huber, StudentT
-from torch_ebip.tuning import TuningSettings
 
 METHODS: dict[str, Callable[[Path, InteractionPrimitive, int], Filter]] = {
     "ebip_tuned": lambda folder, primitive, members: restore(folder, primitive, members),

@@ -20,9 +20,8 @@ import torch
 from experiments.folds import write_values
 from experiments.results import Cell
 from experiments.run_folder import write_json
-from torch_ebip import Filter, InteractionPrimitive
-from torch_ebip.checkpoint import save_checkpoint
-from torch_ebip.session import InteractionSession, SessionSettings
+from torch_ebip import Filter, InteractionPrimitive, InteractionSession, SessionSettings
+from torch_ebip.learning.checkpoint import save_checkpoint
 
 Generator = Callable[[Random, Path, bool], None]
 """Writes a file to a path (and what belongs beside it), valid or with one thing wrong."""

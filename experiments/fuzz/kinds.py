@@ -23,10 +23,19 @@ from experiments.fuzz.worker import Reader
 from experiments.methods import Start, keep, restore, tunable
 from experiments.results import Cell
 from experiments.run_folder import write_json
-from torch_ebip import BSplineBasis, Demonstrations, InteractionPrimitive, Layout, Modality, StackedBasis, ebip
-from torch_ebip.checkpoint import load_checkpoint, save_checkpoint
-from torch_ebip.kinematics import RobotArm
-from torch_ebip.session import InteractionSession, replay
+from torch_ebip import (
+    BSplineBasis,
+    Demonstrations,
+    InteractionPrimitive,
+    InteractionSession,
+    Layout,
+    Modality,
+    RobotArm,
+    StackedBasis,
+    ebip,
+    replay,
+)
+from torch_ebip.learning.checkpoint import load_checkpoint, save_checkpoint
 
 CONFIGURATION = {"seed": 1, "horizons": [0.2, 0.9], "start": {"factor": 10.0}}
 

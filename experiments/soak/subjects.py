@@ -15,12 +15,12 @@ from torch_ebip import (
     EnsembleFilter,
     Filter,
     InteractionPrimitive,
+    InteractionSession,
     LiveFilter,
     bip,
     ebip,
     particle_filter,
 )
-from torch_ebip.session import InteractionSession
 
 START = Start(factor=100.0, sharpness=10.0)
 """About where tuning starts on the simulated task: R times 100."""

@@ -28,8 +28,7 @@ from experiments.faults.jobs import _answers
 from experiments.faults.table import summarise, verdicts
 from experiments.results import Cell
 from tests.conftest import interactions, small_primitive
-from torch_ebip import Demonstrations, Layout, Modality, ebip
-from torch_ebip.noise import StudentT
+from torch_ebip import Demonstrations, Layout, Modality, StudentT, ebip
 
 LAYOUT = Layout(
     [

@@ -7,7 +7,7 @@ import pytest
 
 from experiments.folds import interleave, merge, read_values, run_folds, write_values
 from experiments.results import Cell
-from torch_ebip.ranks import Ranks
+from torch_ebip.learning.ranks import Ranks
 
 CELL = Cell("all", 0.5, "mae", "robot", "rad")
 

@@ -13,7 +13,7 @@ import torch
 
 from experiments.kill import damage, main, stage, strangers
 from experiments.run_folder import RunFolder, write_json
-from torch_ebip.checkpoint import save_checkpoint
+from torch_ebip.learning.checkpoint import save_checkpoint
 
 
 def test_a_killed_run_ends_in_the_same_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -176,8 +176,8 @@ def test_the_start_is_the_best_of_the_grid(tmp_path: Path) -> None:
     best = min(losses, key=lambda entry: entry["loss"])
     assert start == Start(best["factor"], best["sharpness"])
     filter = tunable(primitive, start)
-    assert filter.weighting.sharpness.value.item() == pytest.approx(start.sharpness)
-    ratio = filter.noise.measurement.variance.value / primitive.residual_variance
+    assert filter.analysis.weighting.sharpness.value.item() == pytest.approx(start.sharpness)
+    ratio = filter.model.measurement_noise.variance.value / primitive.residual_variance
     assert ratio.mean().item() == pytest.approx(start.factor, rel=1e-4)
     assert best_start(problem, settings, 6, 100.0, tmp_path / "scan.json") == start
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_ebip.kinematics import RobotArm
+from torch_ebip import RobotArm
 
 A = [0.0, -0.425, -0.39225, 0.0, 0.0, 0.0]
 D = [0.089159, 0.0, 0.0, 0.10915, 0.09465, 0.0823]

@@ -26,12 +26,12 @@ from torch_ebip import (
     InteractionPrimitive,
     LiveFilter,
     StackedBasis,
+    StudentT,
     bip,
     ebip,
     ebip_minus,
     particle_filter,
 )
-from torch_ebip.noise import StudentT
 
 SEEN = torch.tensor([True, True, True, False, False])
 UNIT = [0, 0, 1, 2, 2]
@@ -99,7 +99,7 @@ class Problem:
         self.filter = MAKE[case.kind](InteractionPrimitive.fit(known, StackedBasis([BSplineBasis(6)] * 5)))
         if case.floored:
             with torch.no_grad():
-                self.filter.noise.measurement.variance.raw.fill_(FLOOR)
+                self.filter.model.measurement_noise.variance.raw.fill_(FLOOR)
         self.members = None if case.members is None else torch.tensor(case.members)
         self.y = trajectories[0][:20]
         generator = torch.Generator().manual_seed(case.seed)
@@ -136,7 +136,7 @@ def test_finite_or_a_named_error(case: Case) -> None:
     problem = Problem(case)
     made, unit = problem.filter, problem.unit
     failure = None
-    state = made.initial_state(members=problem.members, generator=problem.generator)
+    state = made.initial_state(demonstrations=problem.members, generator=problem.generator)
     try:
         trace = made(problem.y, problem.observed, state=state, generator=problem.generator)
     except ValueError as error:

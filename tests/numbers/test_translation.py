@@ -23,28 +23,33 @@ from torch_ebip import (
     EnsembleFilter,
     Filter,
     GaussianBasis,
+    GaussianPrior,
+    Inflation,
     InteractionPrimitive,
     LiveFilter,
+    MeasurementNoise,
     PolynomialBasis,
+    SquareRoot,
     StackedBasis,
+    StateSpace,
+    StudentT,
+    Update,
     bip,
     ebip,
     ebip_minus,
     particle_filter,
 )
-from torch_ebip.basis import rank_candidates
-from torch_ebip.filters.priors import GaussianPrior
-from torch_ebip.filters.sequence import map_state
-from torch_ebip.functional import (
+from torch_ebip.filtering.functional import (
     Taper,
     ensemble_covariance,
     ensemble_mean,
     ensemble_update,
     square_root_update,
 )
-from torch_ebip.losses import CRPSLoss, EnergyScoreLoss, TrajectoryLoss
-from torch_ebip.noise import FilterNoise, MeasurementNoise, NoProcessNoise, StudentT
-from torch_ebip.scores import crps
+from torch_ebip.filtering.functional.scores import crps
+from torch_ebip.filtering.states import map_state
+from torch_ebip.interaction.basis import rank_candidates
+from torch_ebip.learning.losses import CRPSLoss, EnergyScoreLoss, TrajectoryLoss
 
 NOISE = 0.01
 """Standard deviation of the noise of the interactions in conftest."""
@@ -76,7 +81,7 @@ class Problem:
             warnings.simplefilter("ignore", UserWarning)
             self.filter = MAKE[kind](InteractionPrimitive.fit(demonstrations.subset(range(1, 25)), SPLINES))
         with torch.no_grad():  # float32 and float64 draw different numbers: no noise, no resampling
-            self.filter.noise.process.phase.acceleration.raw.fill_(-50)
+            self.filter.model.process_noise.phase.acceleration.raw.fill_(-50)
         if kind == "particle":
             self.filter.threshold = 0.0
         self.y = trajectories[0][:25]
@@ -85,7 +90,7 @@ class Problem:
     def answer(self, state: object, gradients: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Mean and deviation of the arm at the end, phase, and the gradient of a score of all of them."""
         dtype = self.y.dtype
-        state = map_state(lambda part: part.to(dtype), state)
+        state = map_state(lambda part: part.to(dtype) if part.is_floating_point() else part, state)
         end = torch.ones(1, dtype=dtype)
         with torch.set_grad_enabled(gradients):
             trace = self.filter(self.y, self.observed, state=state, generator=torch.Generator().manual_seed(0))
@@ -236,10 +241,11 @@ def test_a_filter_of_any_model(inflation: float | None) -> None:
     y = (1e4 + 0.5 * torch.randn(30, 2, generator=generator)).float()
     means = []
     for dtype in (torch.float32, torch.float64):
-        noise = FilterNoise(NoProcessNoise(), MeasurementNoise(torch.ones(2, dtype=dtype)))
         prior = GaussianPrior(torch.zeros(4, dtype=dtype), torch.eye(4, dtype=dtype))
-        model = Linear(torch.eye(2, 4, dtype=dtype) + 0.0)
-        made = EnsembleFilter(Still(), model, noise, prior, 50, 2, 1.0, square_root=True, inflation=inflation)
+        noise = MeasurementNoise(torch.ones(2, dtype=dtype))
+        model = StateSpace(Still(), Linear(torch.eye(2, 4, dtype=dtype) + 0.0), None, noise, 2, 1.0)
+        update = Update(SquareRoot(), inflation=None if inflation is None else Inflation(inflation))
+        made = EnsembleFilter(model, prior, 50, update)
         state = made.initial_state()._replace(deviations=start.to(dtype))
         after = made(y.to(dtype), state=state).state
         means.append((after.mean.double(), after.covariance.double()))

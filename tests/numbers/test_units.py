@@ -29,7 +29,7 @@ from torch_ebip import (
     particle_filter,
     select_basis,
 )
-from torch_ebip.objective import ForecastObjective, Weights
+from torch_ebip.learning.objective import ForecastObjective, Weights
 
 SEEN = torch.tensor([True, True, True, False, False])
 MAKE: dict[str, Callable[[InteractionPrimitive], Filter]] = {

@@ -15,7 +15,13 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from torch_ebip.functional import FactorisationError, Taper, ensemble_update, ensemble_variance, square_root_update
+from torch_ebip.filtering.functional import (
+    FactorisationError,
+    Taper,
+    ensemble_update,
+    ensemble_variance,
+    square_root_update,
+)
 
 
 @dataclass(frozen=True)

@@ -1,17 +1,6 @@
 """A serial robot arm as an `nn.Module`: joint angles in, pose of the tool out, differentiable.
 
-The kinematic chain itself is pytorch-kinematics' (https://github.com/UM-ARM-Lab/pytorch_kinematics), with
-three things put right around it:
-
-- its URDF reader rounds every origin to float32, takes a joint without an axis to turn about z instead of x, and
-  expects well-meant files: here the tree is assembled in float64 from what `urdf.py` reads;
-- its chains are plain objects, so `arm.double()` or `arm.to("cuda")` would leave them behind: here one chain
-  a dtype and device is cast from the float64 original when it is first needed, so that casting there and
-  back loses nothing;
-- its product along the chain writes in place, which `torch.vmap` cannot do, and its default backward pass is a
-  `torch.autograd.Function` whose own derivative is silently wrong: here its matrices are multiplied out of place and
-  differentiated by autograd, which is right to any order;
-- it takes a joint that mimics another for a free one.
+The chain, and what is put right around pytorch-kinematics, is in `chain`.
 """
 
 from __future__ import annotations
@@ -20,37 +9,15 @@ import math
 from collections.abc import Sequence
 from importlib import resources
 from os import PathLike
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
-from torch_ebip.ambient import own_modes, owned, without_autocast
-from torch_ebip.arguments import as_values
-from torch_ebip.kinematics.urdf import UrdfJoint, Vector, chain_of_joints, followed, read_urdf
-from torch_ebip.meaning import Meaning
-
-
-class _Chain(NamedTuple):
-    """What of an arm's n joints is constant, in one dtype on one device.
-
-    Attributes:
-        offsets: [n, 4, 4], from the frame before each joint to the joint's own.
-        axes: [n, 3], of their motion.
-        slides: bool [n, 1, 1], whether a joint is prismatic.
-        end: [4, 4], from the last joint to the end link.
-        sources: int64 [n], which free joint each follows.
-        multipliers, shifts: [n], how.
-    """
-
-    offsets: Tensor
-    axes: Tensor
-    slides: Tensor
-    end: Tensor
-    sources: Tensor
-    multipliers: Tensor
-    shifts: Tensor
+from torch_ebip.common.ambient import own_modes, owned, without_autocast
+from torch_ebip.common.arguments import as_values
+from torch_ebip.common.meaning import Meaning
+from torch_ebip.kinematics.chain import Chain, constants_of, pose_of
+from torch_ebip.kinematics.urdf import UrdfJoint, chain_of_joints, followed, read_urdf
 
 
 class RobotArm(Meaning):
@@ -87,11 +54,11 @@ class RobotArm(Meaning):
         moving = [joint for joint in joints if joint.kind != "fixed"]
         self.joint_names: tuple[str, ...] = tuple(joint.name for joint in moving if joint.mimic is None)
         with own_modes(inference=True), torch.device("cpu"):
-            self._master = _constants(root, joints, follows, self.joint_names)
+            self._master = constants_of(root, joints, follows, self.joint_names)
         self._limits, self._speeds = _limits(moving, follows, self.joint_names)
         self._free = [joint.mimic is None for joint in moving]
         self._units = tuple("m" if _named(moving, name).kind == "prismatic" else "rad" for name in self.joint_names)
-        self._chains: dict[tuple[torch.dtype, torch.device], _Chain] = {}
+        self._chains: dict[tuple[torch.dtype, torch.device], Chain] = {}
         self.register_buffer("tool", owned(_checked_tool(tool)))
 
     @classmethod
@@ -155,7 +122,7 @@ class RobotArm(Meaning):
         dtype = torch.promote_types(joints.dtype, self.tool.dtype)
         chain = self._chain(dtype, joints.device)
         values = joints.to(dtype)
-        return _pose(values, chain) @ self.tool.to(dtype)
+        return pose_of(values, chain) @ self.tool.to(dtype)
 
     def extra_repr(self) -> str:
         """Sizes."""
@@ -165,45 +132,19 @@ class RobotArm(Meaning):
         """What its tool is the tool of, see `Meaning`: joints, and where the end link is at a few of their values."""
         zeros = torch.zeros(self.n_joints, dtype=torch.float64, device="cpu")
         chain = self._chain(torch.float64, zeros.device)
-        ends = [(_pose(zeros + value, chain))[:3].flatten().tolist() for value in (0.0, 0.5)]
+        ends = [(pose_of(zeros + value, chain))[:3].flatten().tolist() for value in (0.0, 0.5)]
         return (
             f"joints={', '.join(self.joint_names)}; ends={[round(number, 6) + 0.0 for end in ends for number in end]}"
         )
 
-    def _chain(self, dtype: torch.dtype, device: torch.device) -> _Chain:
+    def _chain(self, dtype: torch.dtype, device: torch.device) -> Chain:
         """The constants in one dtype on one device, cast once from the float64 originals."""
         key = (dtype, device)
         if key not in self._chains:
             with own_modes(inference=True):  # whoever asks first, everybody may differentiate
                 cast = (part.to(device, dtype if part.is_floating_point() else None) for part in self._master)
-                self._chains[key] = _Chain(*cast)
+                self._chains[key] = Chain(*cast)
         return self._chains[key]
-
-
-def _pose(joints: Tensor, chain: _Chain) -> Tensor:
-    """Pose [..., 4, 4] of the end link at some values [..., n_joints] of the free joints."""
-    if chain.sources.numel() == 0:
-        return chain.end.expand(*joints.shape[:-1], 4, 4)
-    values = torch.addcmul(chain.shifts, joints[..., chain.sources], chain.multipliers)
-    motions = chain.offsets @ _motions(values, chain)
-    pose = motions[..., 0, :, :]
-    for joint in range(1, motions.shape[-3]):
-        pose = pose @ motions[..., joint, :, :]
-    return pose @ chain.end
-
-
-def _motions(values: Tensor, chain: _Chain) -> Tensor:
-    """Homogeneous transforms [..., n, 4, 4] of joints at some values [..., n]."""
-    from pytorch_kinematics.transforms.rotation_conversions import axis_and_angle_to_matrix_33
-
-    axes = chain.axes.expand(*values.shape, 3)
-    identity = torch.eye(4, dtype=values.dtype, device=values.device)
-    turned = axis_and_angle_to_matrix_33(axes, values)
-    motions = functional.pad(turned, (0, 1, 0, 1)) + identity[3:].T @ identity[3:]
-    if bool(chain.slides.any()):
-        slid = identity + functional.pad((axes * values.unsqueeze(-1)).unsqueeze(-1), (3, 0, 0, 1))
-        motions = torch.where(chain.slides, slid, motions)
-    return motions
 
 
 def _named(joints: Sequence[UrdfJoint], name: str) -> UrdfJoint:
@@ -238,68 +179,3 @@ def _checked_tool(tool: Tensor | None) -> Tensor:
     if not torch.equal(tool[3].cpu(), torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=tool.dtype, device="cpu")):
         raise ValueError(f"tool: expected the last row 0, 0, 0, 1 (a homogeneous transform), got {tool[3].tolist()}")
     return tool.detach().clone()
-
-
-def _constants(
-    root: str, joints: Sequence[UrdfJoint], follows: Sequence[tuple[str, float, float]], free: Sequence[str]
-) -> _Chain:
-    """The constants of a chain in float64, its frames by pytorch-kinematics."""
-    # Imported here: it pulls in matplotlib, which nobody without an arm should wait for.
-    from pytorch_kinematics import Transform3d
-    from pytorch_kinematics.chain import Chain, SerialChain
-    from pytorch_kinematics.frame import Frame, Joint, Link
-
-    first = Frame(root, Link(root), Joint(dtype=torch.float64))
-    tip = first
-    for joint in joints:
-        frame = Frame(
-            joint.child,
-            Link(joint.child),
-            Joint(
-                joint.name,
-                offset=Transform3d(matrix=_origin(joint.xyz, joint.rpy), dtype=torch.float64),
-                joint_type=joint.kind,
-                # The axis of a fixed joint may be anything, and is divided by its length.
-                axis=None if joint.kind == "fixed" else joint.axis,
-                dtype=torch.float64,
-            ),
-        )
-        tip.add_child(frame)
-        tip = frame
-    chain = SerialChain(Chain(first, dtype=torch.float64), joints[-1].child if joints else root, dtype=torch.float64)
-    offsets, offset = [], torch.eye(4, dtype=torch.float64, device="cpu")
-    # Frame 0 is the root link's, which no joint moves.
-    for joint, place in zip(joints, chain.joint_offsets[1:], strict=True):
-        offset = offset if place is None else offset @ place[0]
-        if joint.kind != "fixed":
-            offsets.append(offset)
-            offset = torch.eye(4, dtype=torch.float64, device="cpu")
-    slides = [joint.kind == "prismatic" for joint in joints if joint.kind != "fixed"]
-    sources, multipliers, shifts = zip(*follows, strict=True) if follows else ((), (), ())
-    return _Chain(
-        torch.stack(offsets) if offsets else offset.new_empty(0, 4, 4),
-        chain.axes.to(torch.float64),
-        torch.tensor(slides, dtype=torch.bool, device="cpu").view(-1, 1, 1),
-        offset,
-        torch.tensor([free.index(name) for name in sources], dtype=torch.long, device="cpu"),
-        offset.new_tensor(multipliers),
-        offset.new_tensor(shifts),
-    )
-
-
-def _origin(xyz: Vector, rpy: Vector) -> Tensor:
-    """A URDF <origin xyz rpy> as a homogeneous transform [4, 4]; R = Rz(yaw) Ry(pitch) Rx(roll)."""
-    roll, pitch, yaw = rpy
-    cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
-    cy, sy = math.cos(yaw), math.sin(yaw)
-    x, y, z = xyz
-    return torch.tensor(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr, x],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr, y],
-            [-sp, cp * sr, cp * cr, z],
-            [0, 0, 0, 1],
-        ],
-        dtype=torch.float64,
-        device="cpu",
-    )

@@ -7,7 +7,7 @@ from os import PathLike
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
-from torch_ebip.files import read_text
+from torch_ebip.common.files import read_text
 
 LIMIT = 1 << 24
 """Bytes of a URDF."""

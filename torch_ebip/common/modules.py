@@ -1,0 +1,60 @@
+"""Modules that share parameters, and whether parameters have changed."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, TypeVar
+
+from torch import nn
+
+Module = TypeVar("Module", bound=nn.Module)
+
+
+def sharing(module: Module) -> Module:
+    """A second module with the same parameters and parts, not copies of them, whose attributes can be set apart."""
+    twin = copy.copy(module)
+    for registry in ("_parameters", "_buffers", "_modules"):
+        twin.__dict__[registry] = dict(module.__dict__[registry])
+    return twin
+
+
+class FastTwins:
+    """A module whose plain methods have fast twins, which compute the same by another way.
+
+    A subclass that overrides a plain one and not its twins has no twins: they would compute something else. A
+    protocol that asks for them is then not met.
+    """
+
+    twins: ClassVar[Mapping[str, Sequence[str]]] = {}
+    """Of each plain method, the names of its twins."""
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        for plain, twins in cls.twins.items():
+            for twin in twins:
+                if plain in vars(cls) and twin not in vars(cls):
+                    setattr(cls, twin, None)
+
+
+class Versions:
+    """Notices that parameters or buffers of a module have changed in place, as an optimiser or loading does.
+
+    Args:
+        module: whose tensors are watched, those that it has now.
+    """
+
+    def __init__(self, module: nn.Module) -> None:
+        self._tensors = [*module.parameters(), *module.buffers()]
+        self._unversioned = any(tensor.is_inference() for tensor in self._tensors)
+        self._seen: list[int] | None = None
+
+    def changed(self) -> bool:
+        """Whether something has, since the last call; always at first, and where torch keeps no versions."""
+        if self._unversioned:
+            return True
+        now = [tensor._version for tensor in self._tensors]
+        if now == self._seen:
+            return False
+        self._seen = now
+        return True

@@ -1,0 +1,272 @@
+"""Members that stay in the span of where they started, changed in place and without gradients.
+
+It gives the same numbers as the dense carrier for the same draws, faster:
+
+- what sensors do not see waits until somebody asks for it (`ColumnMembers`): a step does not pay for it;
+- members are columns, so that what moves, projections and features lie contiguously, and products go into the
+  members;
+- R is diagonal, and what depends on parameters alone is computed when one of them has changed;
+- buffers are kept from step to step, a set for each set of DoFs that are measured together (`Plan`).
+
+It serves a model of which a part neither moves nor is stirred, if its parts speak the protocols that `why_not_span`
+asks for, and an update that mixes whole members.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from torch_ebip.common.draws import Generators, is_several, standard_normal
+from torch_ebip.common.modules import Versions
+from torch_ebip.filtering.carriers.carrier import Carrier, Measured
+from torch_ebip.filtering.carriers.columns import ColumnMembers
+from torch_ebip.filtering.carriers.plan import Plan, kept
+from torch_ebip.filtering.carriers.serving import AdvancesColumns, HasFactor, ProjectsColumns, why_not_span
+from torch_ebip.filtering.centring import taken_out
+from torch_ebip.filtering.functional.innovation import Taper
+from torch_ebip.filtering.functional.linear import FactorisationError, cholesky
+from torch_ebip.filtering.functional.moments import member_shares
+from torch_ebip.filtering.functional.update import Spread
+from torch_ebip.filtering.model import StateSpace
+from torch_ebip.filtering.states import EnsembleState, map_state
+from torch_ebip.filtering.updates.rules import Columns, Rule
+from torch_ebip.filtering.updates.update import Update
+
+
+class SpanCarrier(Carrier):
+    """The members of one sequence, or of a batch of them in step, at work.
+
+    Args:
+        model, update: that it serves, see `why_not_span`.
+        sensors: bool [D], the DoFs that may be measured. The fewer, the faster.
+        state: where to start.
+        generator: of all draws.
+
+    Raises:
+        ValueError: a model or an update that it cannot serve: says why.
+    """
+
+    def __init__(
+        self, model: StateSpace, update: Update, sensors: Tensor, state: EnsembleState, generator: Generators
+    ) -> None:
+        reason = why_not_span(model, update)
+        if reason is not None:
+            raise ValueError(f"members cannot be transformed as wholes: {reason}; use the dense engine")
+        view = model.view(sensors)
+        part = model.select(view)
+        assert isinstance(part.dynamics, AdvancesColumns)
+        assert isinstance(part.process_noise, HasFactor)
+        assert isinstance(part.measurement, ProjectsColumns)
+        assert part.moving is not None
+        self._whole, self._model, self._update, self._generator = model, part, update.select(view), generator
+        self._dynamics, self._process, self._measurement = part.dynamics, part.process_noise, part.measurement
+        self._sensors = {dof: row for row, dof in enumerate(view.dofs.tolist())}
+        if state.centre is None:  # made by hand
+            state = taken_out(model, state)
+        assert state.centre is not None
+        start, self._centre = state.deviations, state.centre
+        self.memory = update.complete(state.memory, start)
+        self.batch_shape, m = tuple(start.shape[:-2]), part.moving
+        seen = view.state[m:] - m
+        self._columns = ColumnMembers(start, seen, m)
+        self._middle = state.centre[..., view.state[m:]]
+        self.matrix, self._moving = self._columns.matrix, self._columns.moving
+        E = start.shape[-2]
+        self._draws = start.new_empty(*start.shape[:-1], m)
+        self._draws_by_entry = self._draws.transpose(-1, -2)
+        self._equal = start.new_full((*self.batch_shape, E, 1), 1 / E)
+        self._terms = start.new_empty(math.prod(self.batch_shape) * len(seen) * E)
+        self._plans: OrderedDict[tuple[bool, ...], Plan | None] = OrderedDict()
+        self._noise, self._noise_versions = None, Versions(part.measurement_noise)
+        self._step_factor: tuple[float, Tensor] | None = None
+        self._process_versions = Versions(part.process_noise)
+        batched = bool(self.batch_shape)
+        self._add_product: Callable[..., Tensor] = Tensor.baddbmm_ if batched else Tensor.addmm_
+        self._plus_product: Callable[..., Tensor] = torch.baddbmm if batched else torch.addmm
+
+    @property
+    def moving(self) -> Tensor:
+        """See `Carrier.moving`: a view."""
+        return self._moving.transpose(-1, -2)
+
+    @property
+    def mean(self) -> Tensor:
+        """See `Carrier.mean`."""
+        return (self._moving @ self._even).squeeze(-1)
+
+    @property
+    def finite(self) -> bool:
+        """Whether members and weights are, and small enough for their variance to be."""
+        flat = self.matrix.view(-1)
+        size = float(torch.dot(flat, flat))
+        weighting = self.memory.weighting
+        return math.isfinite(size if weighting is None else size + float(weighting.weights.sum()))
+
+    def state(self, columns: Tensor | None = None, entry: int | None = None) -> EnsembleState:
+        """A copy of everything, for the filter.
+
+        Args:
+            columns: int64 [k], which of the entries that stand still; default: all.
+            entry: of the batch, without that dimension; default: all of it.
+        """
+        memory, centre, m = self.memory, self._centre, self._moving.shape[-2]
+        if columns is None:
+            columns = torch.arange(centre.shape[-1] - m, device=centre.device)
+        if entry is not None:
+            centre = centre[entry]
+            memory = map_state(lambda part: part[entry], memory)
+        centre = torch.cat([centre[..., :m], centre[..., m + columns]], dim=-1)
+        return EnsembleState(self._columns.members(columns, entry), memory, centre)
+
+    def predict(self, dt: float) -> None:
+        """x = g(x) + N(0, Q) over dt seconds, finite and not negative."""
+        if self._process_versions.changed() or self._step_factor is None or self._step_factor[0] != dt:
+            factor = self._process.factor(self.matrix.new_tensor(dt))
+            self._step_factor = dt, factor.expand(*self.batch_shape, *factor.shape[-2:])
+        self._dynamics.advance_(self._moving, dt)
+        self._drawn(self._draws)
+        self._add_product(self._moving, self._step_factor[1], self._draws_by_entry)
+        if self.memory.weighting is not None:
+            self.memory = self._update.forget(self.memory, self.matrix.new_tensor(dt))
+
+    def take(self, y: Tensor, measured: tuple[bool, ...], mask: Tensor | None) -> Tensor:
+        """Take in one sample that was checked.
+
+        Args:
+            y: [..., D], units of the DoFs.
+            measured: D, which DoFs some entry of the batch measured.
+            mask: bool [B, D], which of them each entry did; None if all did.
+
+        Returns:
+            Log-likelihood [...].
+
+        Raises:
+            ValueError: see `LiveFilter.update`.
+        """
+        plan = kept(self._plans, measured, self._make_plan)
+        perturbs, draws = self._update.rule.perturbs, None
+        if perturbs and is_several(self._generator):
+            # What one sequence draws may not depend on what others measure.
+            shape = (*self.batch_shape, self.matrix.shape[-1], self._whole.n_dofs)
+            draws = standard_normal(shape, self.matrix, self._generator)
+        if plan is None:
+            return self.matrix.new_zeros(self.batch_shape)
+        if draws is not None:
+            torch.index_select(draws, -1, plan.dofs, out=plan.draws)
+        elif perturbs:
+            self._drawn(plan.draws)
+        sample = self._measure(plan, y, mask)
+        return self._update(self, sample, plan.draws_by_dof if perturbs else None)  # type: ignore[no-any-return]
+
+    def variance(self) -> Tensor:
+        """See `Carrier.variance`; what is NaN or infinite would pass for far off, so it is refused here."""
+        self._plan.check_finite(self._seen)
+        return self._share * (self._plan.anomalies * self._weighted.transpose(-1, -2)).sum(-1)
+
+    def move(
+        self, rule: Rule, measured: Measured, taper: Taper | None, spread: Spread, perturbations: Tensor | None
+    ) -> Tensor:
+        """See `Carrier.move`; perturbations [..., K, E]."""
+        plan, seen, weighted, even = self._plan, self._seen, self._weighted, self._even
+        y, deviation, R = plan.values, self._deviation, self._R
+        if measured is not self._measured:  # other values and deviations are believed
+            y, believed = measured.y, measured.deviation.unsqueeze(-1)
+            R = R + torch.diag_embed((believed.square() - deviation.square())[..., 0])
+            deviation = believed
+        S = self._plus_product(R, plan.anomalies, weighted, alpha=self._share)
+        factor, info = torch.linalg.cholesky_ex(S)
+        if bool(info.any() if self.batch_shape else info):
+            self._explain(S, plan)
+        residual = torch.sub(y.unsqueeze(-1), measured.mean.unsqueeze(-1), out=plan.residual)
+        if seen is not None:
+            residual.masked_fill_(~seen, 0)
+        columns = Columns(plan.anomalies, residual, deviation, factor, plan.right, plan.solved)
+        moves, shift = rule.columns(columns, perturbations)
+        likelihood = plan.log_likelihood(factor, residual, shift, seen)
+        if spread.keep is not None:
+            moves = torch.lerp(moves @ even, moves, spread.keep[..., None, None])
+        self._add_product(self.matrix, self.matrix @ weighted, moves, alpha=self._share)
+        if spread.scale is not None:
+            scale = spread.scale if seen is None else torch.where(seen.any(-2)[..., 0], spread.scale, 1)
+            self.matrix.lerp_(self.matrix @ even, (1 - scale)[..., None, None])
+        return likelihood
+
+    def project(self, dofs: tuple[bool, ...]) -> Tensor:
+        """[..., K], mean of h(x) of some of the sensors' DoFs, a bool for each DoF of the filter."""
+        plan = kept(self._plans, dofs, self._make_plan)
+        assert plan is not None
+        return (plan.project() @ self._even).squeeze(-1)
+
+    def _measure(self, plan: Plan, y: Tensor, mask: Tensor | None) -> Measured:
+        """What is measured and what is expected; the anomalies are left in the plan."""
+        torch.index_select(y, -1, plan.dofs, out=plan.values)
+        weighting, even = self.memory.weighting, self._even
+        projections = plan.project()
+        mean = projections @ even
+        anomalies = torch.sub(projections, mean, out=plan.anomalies)
+        # Once more: a mean of values far from 0 is rounded, and products need anomalies that sum to 0.
+        anomalies.sub_(anomalies @ even)
+        deviation, R = self._believed(plan)
+        seen = None
+        if mask is not None:
+            seen = mask.index_select(-1, plan.dofs).unsqueeze(-1)
+            one = torch.eye(R.shape[-1], dtype=R.dtype, device=R.device)
+            deviation, R = torch.where(seen, deviation, 0), torch.where(seen, R, one)
+            anomalies.masked_fill_(~seen, 0)
+        self._weighted, self._share = plan.anomalies_by_member, 1 / (anomalies.shape[-1] - 1)
+        if weighting is not None:
+            self._weighted = self._weighted * member_shares(self._weighted, weighting.weights)
+            self._share = 1.0
+        self._plan, self._seen, self._deviation, self._R = plan, seen, deviation, R
+        observed = None if seen is None else seen[..., 0]
+        self._measured = Measured(plan.values, observed, mean[..., 0], deviation[..., 0], plan.rows)
+        return self._measured
+
+    def _believed(self, plan: Plan) -> tuple[Tensor, Tensor]:
+        """R of a plan's DoFs, kept while no parameter changes, unless it depends on the state."""
+        if self._model.noise_depends_on_state:
+            return plan.believe(self._model.deviation(self.mean))
+        if self._noise_versions.changed():
+            for other in self._plans.values():
+                if other is not None:
+                    other.noise = None
+        if plan.noise is None:
+            plan.noise = plan.believe(self._model.deviation(None))
+        return plan.noise
+
+    @property
+    def _even(self) -> Tensor:
+        """What each member counts in a mean, [..., E, 1]."""
+        weighting = self.memory.weighting
+        return self._equal if weighting is None else weighting.weights.unsqueeze(-1)
+
+    def _drawn(self, buffer: Tensor) -> Tensor:
+        """The buffer, filled with standard-normal draws: those that `standard_normal` would make."""
+        generator = self._generator
+        if generator is None or (isinstance(generator, torch.Generator) and generator.device == buffer.device):
+            return buffer.normal_(generator=generator)
+        return buffer.copy_(standard_normal(buffer.shape, buffer, generator))
+
+    def _make_plan(self, measured: tuple[bool, ...]) -> Plan | None:
+        """Buffers for the DoFs that are measured together; None for none."""
+        dofs = [dof for dof, here in enumerate(measured) if here]
+        strangers = [dof for dof in dofs if dof not in self._sensors]
+        if strangers:
+            raise ValueError(
+                f"DoFs {strangers[:8]} are measured, but are none of those this live filter was made for"
+            )
+        if not dofs:
+            return None
+        rows = [self._sensors[dof] for dof in dofs]
+        return Plan(self._measurement, self._columns, self._middle, dofs, rows, self._terms)
+
+    def _explain(self, S: Tensor, plan: Plan) -> None:
+        try:
+            cholesky(S, plan.dofs)
+        except FactorisationError as error:
+            raise self._whole.named(error, None) from error

@@ -1,0 +1,286 @@
+"""A state-space model: dynamics g, measurement h and their noise; whole, or narrowed to some of its DoFs.
+
+Any modules will do. What they may say beyond computing their values is in the protocols below: a filter asks for a
+protocol, never for a class, so that a model of somebody else's gets all that it says it can do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import torch
+from torch import Tensor, nn
+
+from torch_ebip.common.arguments import as_count, as_mask, as_number
+from torch_ebip.common.draws import Generators
+from torch_ebip.common.modules import sharing
+from torch_ebip.filtering import functional
+from torch_ebip.filtering.noise.measurement import SaysWhatItDependsOn, SelectedNoise
+from torch_ebip.filtering.noise.process import NoProcessNoise
+
+
+class View(NamedTuple):
+    """Some of a model.
+
+    Attributes:
+        dofs: int64 [k], which DoFs, ascending.
+        state: int64 [m], which entries of the state, ascending; what moves is always among them.
+        stride: how many samples each one stands for, on top of what it did.
+    """
+
+    dofs: Tensor
+    state: Tensor
+    stride: int = 1
+
+
+@runtime_checkable
+class Moves(Protocol):
+    """Dynamics or an additive process noise that say which part of a state they touch."""
+
+    @property
+    def moving(self) -> int | None:
+        """How many leading entries; None for all."""
+
+
+@runtime_checkable
+class MayLeaveSpan(Protocol):
+    """A part that may move what stands still out of the span of the first ensemble."""
+
+    @property
+    def leaves_span(self) -> str | None:
+        """Why it does; None if it does not."""
+
+
+@runtime_checkable
+class Narrows(Protocol):
+    """A part that can be narrowed to some of the DoFs and of the state, with its parameters, not copies of them."""
+
+    def select(self, view: View) -> Any:
+        """The same for a view of the model."""
+
+
+@runtime_checkable
+class Rows(Protocol):
+    """A measurement that can be asked for some DoFs, of what moves and what stands still of a state, apart."""
+
+    def rows(self, moving: Tensor, still: Tensor, dofs: Sequence[int] | None, centre: Tensor | None = None) -> Tensor:
+        """h [..., E, k] for ascending dofs, None for all.
+
+        Of entries that move [..., E, m] and others [..., E, n - m], the latter as deviations from a centre [..., n
+        - m].
+        """
+
+
+@runtime_checkable
+class AddsInPlace(Protocol):
+    """A process noise that can be added to members that nobody else holds: one copy less."""
+
+    def add_(self, members: Tensor, dt: Tensor, generator: Any = None) -> Tensor:
+        """Members [..., E, n] with noise added, in place."""
+
+
+@runtime_checkable
+class MakesNewMembers(Protocol):
+    """Dynamics whose result is never their argument, nor a view of it."""
+
+    makes_new_members: bool
+
+
+@runtime_checkable
+class Entries(Protocol):
+    """A measurement that knows on which entries of the state a DoF depends, beside those that move."""
+
+    def entries(self, dofs: Tensor) -> Tensor:
+        """int64 [m], ascending, for some DoFs, bool [D]."""
+
+
+class StateSpace(nn.Module):
+    """x' = g(x, dt) + N(0, Q), y = h(x) + N(0, R): an immutable bundle of modules.
+
+    Args:
+        dynamics: g, maps members [..., E, n] and dt [...] (s) to members.
+        measurement: h, maps members [..., E, n] to values [..., E, D], units of the DoFs.
+        process_noise: Q, maps members, dt and a generator to members with noise added; default: none.
+        measurement_noise: R, maps the mean of what moves, [..., m], to standard deviations [D] or [..., D].
+        dofs: names of the DoFs, for error messages; or their number D.
+        dt: seconds between samples where none is given.
+
+    Raises:
+        ValueError: no DoF, a dt that is not a positive number of seconds, a measurement noise of another width.
+
+    Example:
+        >>> import torch
+        >>> from torch_ebip import MeasurementNoise, StateSpace
+        >>> class Still(torch.nn.Module):
+        ...     def forward(self, x, *dt):
+        ...         return x
+        >>> model = StateSpace(Still(), Still(), None, MeasurementNoise(torch.ones(2)), ("x", "y"), dt=0.1)
+    """
+
+    def __init__(
+        self,
+        dynamics: nn.Module,
+        measurement: nn.Module,
+        process_noise: nn.Module | None,
+        measurement_noise: nn.Module,
+        dofs: Sequence[str] | int,
+        dt: float,
+    ) -> None:
+        super().__init__()
+        self.dynamics = dynamics
+        self.measurement = measurement
+        self.process_noise = NoProcessNoise() if process_noise is None else process_noise
+        self.measurement_noise = measurement_noise
+        self.dof_names = None if isinstance(dofs, int) else tuple(dofs)
+        self.n_dofs = as_count("dofs", dofs if isinstance(dofs, int) else len(dofs))
+        self.dt = as_number("dt", dt, 0, above=True, of="of seconds")
+        self.stride = 1
+        if not self.noise_depends_on_state:
+            with torch.no_grad():
+                width = self.deviation(None).shape[-1]
+            if width != self.n_dofs:
+                raise ValueError(
+                    f"the measurement noise, a {type(measurement_noise).__name__}, is of {width} DoFs, "
+                    f"the model has {self.n_dofs}"
+                )
+
+    @property
+    def leading(self) -> int | None:
+        """m, how many leading entries the dynamics move; None for all of them, as of dynamics that do not say."""
+        return self.dynamics.moving if isinstance(self.dynamics, Moves) else None
+
+    @property
+    def moving(self) -> int | None:
+        """How many leading entries move or are stirred, the rest stands still; None for all, or if nobody says."""
+        stirred = self.process_noise.moving if isinstance(self.process_noise, Moves) else None
+        return None if self.leading is None or stirred is None else max(self.leading, stirred)
+
+    @property
+    def leaves_span(self) -> str | None:
+        """Why members leave the span of the first ensemble while they are propagated; None if they do not."""
+        parts = (part for part in (self.dynamics, self.process_noise) if isinstance(part, MayLeaveSpan))
+        return next((part.leaves_span for part in parts if part.leaves_span is not None), None)
+
+    def difference(self, a: Tensor, b: Tensor) -> Tensor:
+        """a - b of states [..., n]. A model on a circle or of rotations says otherwise."""
+        return a - b
+
+    def mean(self, members: Tensor, member_weights: Tensor | None = None) -> Tensor:
+        """Mean [..., m] of entries of members [..., E, m], their ``member_weights`` [..., E]; see `difference`."""
+        return functional.ensemble_mean(members, member_weights)
+
+    def project(self, members: Tensor, rows: Tensor | None = None, centre: Tensor | None = None) -> Tensor:
+        """h [..., E, k] of members [..., E, n], for some DoFs int64 [k], ascending; None for all.
+
+        Args:
+            members: [..., E, n], as they are, or as deviations from a centre.
+            rows: int64 [k].
+            centre: [..., n].
+
+        Raises:
+            ValueError: a measurement that gives another number of values than there are DoFs.
+        """
+        if isinstance(self.measurement, Rows) and self.leading is not None:
+            moving, still = self.split(members)
+            centre = None if centre is None or not bool(centre.any()) else centre[..., self.leading :]
+            return self.measurement.rows(moving, still, None if rows is None else rows.tolist(), centre)
+        values: Tensor = self.measurement(members if centre is None else members + centre.unsqueeze(-2))
+        if values.shape != (*members.shape[:-1], self.n_dofs):
+            raise ValueError(
+                f"the measurement, a {type(self.measurement).__name__}, must map members {list(members.shape)} to "
+                f"values {[*members.shape[:-1], self.n_dofs]}, one for each DoF, but gave {list(values.shape)}"
+            )
+        return values if rows is None else values[..., rows]
+
+    def split(self, members: Tensor) -> tuple[Tensor, Tensor]:
+        """What moves [..., E, m] and what stands still [..., E, n - m] of members [..., E, n].
+
+        A split, not two slices: its backward pass is one concatenation instead of two mostly empty tensors.
+        """
+        m = self.leading
+        if m is None:
+            return members, members[..., :0]
+        moving, still = torch.split(members, [m, members.shape[-1] - m], dim=-1)
+        return moving, still
+
+    def advance(self, members: Tensor, dt: Tensor, generator: Generators) -> Tensor:
+        """g(x) + N(0, Q): members [..., E, n] after dt [...] seconds, drawn with a generator."""
+        moved: Tensor = self.dynamics(members, dt)
+        noise = self.process_noise
+        new = isinstance(self.dynamics, MakesNewMembers) and self.dynamics.makes_new_members
+        if new and isinstance(noise, AddsInPlace):
+            return noise.add_(moved, dt, generator)
+        return noise(moved, dt, generator)  # type: ignore[no-any-return]
+
+    @property
+    def noise_depends_on_state(self) -> bool:
+        """Whether R changes during a sequence; assumed of noises that do not say."""
+        noise = self.measurement_noise
+        return noise.depends_on_state if isinstance(noise, SaysWhatItDependsOn) else True
+
+    def deviation(self, moving: Tensor | None) -> Tensor:
+        """Standard deviations of a sample, [D] or [..., D], units of the DoFs.
+
+        Args:
+            moving: [..., m], mean of what moves; None where R does not depend on the state.
+        """
+        return self.measurement_noise(moving)  # type: ignore[no-any-return]
+
+    def view(self, dofs: Tensor, stride: int = 1) -> View:
+        """What of the model some DoFs, bool [D], need.
+
+        Args:
+            dofs: bool [D], at least one of them True.
+            stride: how many samples each one stands for.
+
+        Raises:
+            ValueError: a mask of another length or kind.
+            TypeError: a measurement that does not know what a DoF depends on.
+        """
+        if not isinstance(self.measurement, Entries) or self.leading is None:
+            raise TypeError(
+                f"a {type(self.measurement).__name__} does not say on which entries of a state each DoF depends, or "
+                "everything moves: the model cannot be restricted to some DoFs"
+            )
+        device = next((tensor.device for tensor in [*self.parameters(), *self.buffers()]), torch.device("cpu"))
+        dofs = as_mask("dofs", dofs, self.n_dofs).cpu()
+        entries = self.measurement.entries(dofs)
+        state = torch.cat([torch.arange(self.leading, device="cpu"), entries.cpu()])
+        return View(dofs.nonzero().squeeze(-1).to(device), state.to(device), as_count("stride", stride))
+
+    def select(self, view: View) -> StateSpace:
+        """The model of a view, with the same parameters, not copies of them.
+
+        Raises:
+            TypeError: a part that cannot be narrowed.
+        """
+        part = sharing(self)
+        for name in ("dynamics", "measurement", "process_noise"):
+            whole = getattr(self, name)
+            if not isinstance(whole, Narrows):
+                raise TypeError(f"a {type(whole).__name__} cannot be restricted to some DoFs: it has no `select`")
+            setattr(part, name, whole.select(view))
+        noise = self.measurement_noise
+        part.measurement_noise = noise.select(view) if isinstance(noise, Narrows) else SelectedNoise(noise, view)
+        names = self.dof_names
+        part.dof_names = None if names is None else tuple(names[i] for i in view.dofs.tolist())
+        part.n_dofs = len(view.dofs)
+        part.dt, part.stride = self.dt * view.stride, self.stride * view.stride
+        return part
+
+    def named(self, error: functional.FactorisationError, rows: Tensor | None) -> ValueError:
+        """The error of a factorisation over some DoFs, with their names.
+
+        Args:
+            error: that was raised.
+            rows: int64 [k], which of the model's DoFs it numbers; None for all.
+        """
+        if self.dof_names is None:
+            return error
+        names = (self.dof_names[i if rows is None else int(rows[i])] for i in error.dofs)
+        return ValueError(f"{error} ({', '.join(names)})")
+
+    def extra_repr(self) -> str:
+        """How many DoFs, and how often they are measured."""
+        return f"n_dofs={self.n_dofs}, dt={self.dt:g}"

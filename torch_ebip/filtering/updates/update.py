@@ -1,0 +1,153 @@
+"""The measurement update, step 3 of the paper's box: which parts it has, and the one order in which they act."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+
+from torch_ebip.common.modules import sharing
+from torch_ebip.filtering.functional import Spread
+from torch_ebip.filtering.model import View
+from torch_ebip.filtering.states import Memory
+from torch_ebip.filtering.updates.inflation import SpreadRule
+from torch_ebip.filtering.updates.localisation import Localisation
+from torch_ebip.filtering.updates.part import Part
+from torch_ebip.filtering.updates.rules import Rule, Stochastic
+from torch_ebip.filtering.updates.trust import RobustWeights
+from torch_ebip.filtering.updates.weighting import Seen, Weighting
+
+if TYPE_CHECKING:
+    from torch_ebip.filtering.carriers.carrier import Carrier, Measured
+
+
+class Update(nn.Module):
+    """What happens at a measurement. Slots, not a list: their order is part of the algebra.
+
+    Args:
+        rule: how an innovation moves the members: `Stochastic`, the paper's, or `SquareRoot`.
+        trust: what surprising values count, each on top of those before it: `StudentT`, `Huber`, `Gate`.
+        weighting: weighs members by what was seen.
+        localisation: factors on the cross-covariances of blocks of the state.
+        inflation: what becomes of the anomalies: `Inflation`.
+
+    Example:
+        >>> from torch_ebip import Inflation, SquareRoot, StudentT, Update
+        >>> update = Update(SquareRoot(), trust=[StudentT()], inflation=Inflation(1.01))
+    """
+
+    trust: nn.ModuleList
+    weighting: Weighting | None
+    localisation: Localisation | None
+    inflation: SpreadRule | None
+
+    def __init__(
+        self,
+        rule: Rule | None = None,
+        trust: Iterable[RobustWeights] = (),
+        weighting: Weighting | None = None,
+        localisation: Localisation | None = None,
+        inflation: SpreadRule | None = None,
+    ) -> None:
+        super().__init__()
+        self.rule = Stochastic() if rule is None else rule
+        self.trust = nn.ModuleList(trust)
+        self.weighting = weighting
+        self.localisation = localisation
+        self.inflation = inflation
+
+    @property
+    def parts(self) -> list[Part]:
+        """All that there are, in their order."""
+        slots = (self.rule, *self.trust, self.weighting, self.localisation, self.inflation)
+        return [part for part in slots if isinstance(part, Part)]
+
+    @property
+    def leaves_span(self) -> str | None:
+        """Why members do not stay in the span of the first ensemble; None if they do."""
+        return next((part.leaves_span for part in self.parts if part.leaves_span is not None), None)
+
+    def start(self, members: Tensor, origin: Tensor | None) -> Memory:
+        """What is remembered of members [..., E, n] that have seen nothing.
+
+        Args:
+            members: [..., E, n], as they start.
+            origin: int64 [..., E], as which of the prior's states; None where it does not know.
+        """
+        weighting = None if self.weighting is None or origin is None else self.weighting.start(origin)
+        return Memory(weighting, None if self.inflation is None else self.inflation.start(members), origin)
+
+    def complete(self, memory: Memory, members: Tensor) -> Memory:
+        """The memory of a state made by hand, with members [..., E, n], as if it had seen nothing."""
+        if self.inflation is None or memory.inflation is not None:
+            return memory
+        return memory._replace(inflation=self.inflation.start(members))
+
+    def forget(self, memory: Memory, dt: Tensor) -> Memory:
+        """What is left of a memory after dt [...] seconds."""
+        if self.weighting is None or memory.weighting is None:
+            return memory
+        return memory._replace(weighting=self.weighting.forget(memory.weighting, dt))
+
+    def select(self, view: View) -> Update:
+        """The update of a view of the model: every part narrows itself."""
+        part = sharing(self)
+        part.rule = self.rule.select(view)
+        part.trust = nn.ModuleList([trust.select(view) for trust in self.trust])  # type: ignore[operator]
+        for name in ("weighting", "localisation", "inflation"):
+            slot = getattr(self, name)
+            setattr(part, name, None if slot is None else slot.select(view))
+        return part
+
+    def forward(self, carrier: Carrier, measured: Measured, perturbations: Tensor | None) -> Tensor:
+        """x = x + K (y + eps - h(x)), and what is learned beside it.
+
+        Args:
+            carrier: of the members; changed, unless an error is raised.
+            measured: what was measured.
+            perturbations: standard-normal draws [..., E, K], for `Carrier.move`; None if the rule does not perturb.
+
+        Returns:
+            The log-likelihood [...] of what was measured.
+        """
+        memory, observed, trust = carrier.memory, measured.observed, None
+        if len(self.trust):
+            measured, trust = self._trusted(carrier, measured)
+        weighting, inflation, spread = memory.weighting, memory.inflation, Spread()
+        if self.weighting is not None and weighting is not None:
+            origin = memory.origin
+            assert origin is not None
+            seen = Seen(measured.y, observed, trust, measured.rows, carrier.moving, carrier.mean, origin)
+            weighting = self.weighting.learn(weighting, seen)
+        if self.inflation is not None:
+            spread, inflation = self.inflation(inflation, _share(measured, trust))
+        taper = None if self.localisation is None else self.localisation()
+        likelihood = carrier.move(self.rule, measured, taper, spread, perturbations)
+        carrier.memory = Memory(weighting, inflation, memory.origin)
+        return likelihood
+
+    def _trusted(self, carrier: Carrier, measured: Measured) -> tuple[Measured, Tensor]:
+        """Values and deviations that deserve belief, and how much each value counts."""
+        observed, variance = measured.observed, carrier.variance()
+        y, deviation = measured.y, measured.deviation
+        if observed is not None:
+            y = torch.where(observed, y, 0)
+        total: Tensor | None = None
+        for weigh in self.trust:
+            y, deviation, trust = weigh(y, measured.mean, variance, deviation)
+            total = trust if total is None else total * trust
+        assert total is not None
+        if observed is not None:
+            deviation, total = torch.where(observed, deviation, 0), torch.where(observed, total, 0)
+        return measured._replace(y=y, deviation=deviation), total
+
+
+def _share(measured: Measured, trust: Tensor | None) -> Tensor:
+    """What a sample counts, [...], in [0, 1]."""
+    if trust is not None:
+        return trust.amax(-1)
+    if measured.observed is None:
+        return measured.mean.new_ones(measured.mean.shape[:-1])
+    return measured.observed.any(-1).to(measured.mean)

@@ -1,0 +1,75 @@
+"""Interactions: phase, bases, primitives, and the filters of the paper over them."""
+
+from torch_ebip.interaction.basis import (
+    Basis,
+    BSplineBasis,
+    CandidateFit,
+    GaussianBasis,
+    PolynomialBasis,
+    SigmoidBasis,
+    StackedBasis,
+    default_candidates,
+    rank_candidates,
+    select_basis,
+    selection_table,
+)
+from torch_ebip.interaction.constant_velocity import ConstantVelocityPhase
+from torch_ebip.interaction.evidence import Evidence, EvidenceWeighting
+from torch_ebip.interaction.filters import (
+    InteractionEnsembleFilter,
+    InteractionExtendedFilter,
+    InteractionFilter,
+    InteractionParticleFilter,
+)
+from torch_ebip.interaction.forecast import Forecast
+from torch_ebip.interaction.gated_noise import PhaseGatedNoise
+from torch_ebip.interaction.mixture import MixturePrior
+from torch_ebip.interaction.model import demonstration_states, interaction_model
+from torch_ebip.interaction.noise import InteractionNoise, PhaseNoise, WeightNoise
+from torch_ebip.interaction.phase import PhaseModel
+from torch_ebip.interaction.presets import bip, ebip, ebip_minus, particle_filter
+from torch_ebip.interaction.primitive import InteractionPrimitive
+from torch_ebip.interaction.priors import DemonstrationPrior, MomentPrior
+from torch_ebip.interaction.projection import BasisProjection
+from torch_ebip.interaction.table import DemonstrationTable
+from torch_ebip.interaction.trace import InteractionTrace
+
+__all__ = [
+    "BSplineBasis",
+    "Basis",
+    "BasisProjection",
+    "CandidateFit",
+    "ConstantVelocityPhase",
+    "DemonstrationPrior",
+    "DemonstrationTable",
+    "Evidence",
+    "EvidenceWeighting",
+    "Forecast",
+    "GaussianBasis",
+    "InteractionEnsembleFilter",
+    "InteractionExtendedFilter",
+    "InteractionFilter",
+    "InteractionNoise",
+    "InteractionParticleFilter",
+    "InteractionPrimitive",
+    "InteractionTrace",
+    "MixturePrior",
+    "MomentPrior",
+    "PhaseGatedNoise",
+    "PhaseModel",
+    "PhaseNoise",
+    "PolynomialBasis",
+    "SigmoidBasis",
+    "StackedBasis",
+    "WeightNoise",
+    "bip",
+    "default_candidates",
+    "demonstration_states",
+    "ebip",
+    "ebip_minus",
+    "interaction_model",
+    "particle_filter",
+    "rank_candidates",
+    "select_basis",
+    "selection_table",
+]

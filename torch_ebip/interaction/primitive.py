@@ -1,0 +1,181 @@
+"""The interaction primitive: what a set of demonstrations says in the space of basis weights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torch_ebip.common.ambient import in_own_modes, owned
+from torch_ebip.common.arguments import as_indices
+from torch_ebip.common.meaning import Meaning
+from torch_ebip.interaction.basis.regression import (
+    Samples,
+    correlation_time,
+    mean_squared_residual,
+    measured_variance,
+    regress,
+    samples_of,
+)
+from torch_ebip.interaction.basis.selection import select_basis
+from torch_ebip.interaction.basis.stacked import StackedBasis
+from torch_ebip.recordings.demonstrations import Demonstrations
+from torch_ebip.recordings.layout import Layout
+from torch_ebip.recordings.repeats import longest_repeats
+
+
+class InteractionPrimitive(Meaning):
+    """Weights, phase velocities and closed-form noise of N demonstrations; made by `fit`.
+
+    Attributes:
+        layout: what the D DoFs are.
+        basis: one basis a DoF.
+        rate: samples a second of the demonstrations, Hz.
+        weights: [N, n_weights], least-squares weights of each demonstration.
+        phase_velocity: [N], 1 / duration, 1/s.
+        residual_variance: [D], the paper's closed-form R (Section IV): the mean over demonstrations of each
+            one's mean squared residual, in squared units of the DoF.
+        residual_correlation_time: [D], integrated autocorrelation time of those residuals, in samples.
+        value_variance: [D], variance of each DoF over all measured samples, squared units; 0 for a constant.
+        longest_repeat: [M] seconds for which each modality says the same to the last digit; see `longest_repeats`.
+        end_variance: [D], variance over demonstrations of h(1, w), squared units.
+    """
+
+    weights: Tensor
+    phase_velocity: Tensor
+    residual_variance: Tensor
+    residual_correlation_time: Tensor
+    value_variance: Tensor
+    longest_repeat: Tensor
+
+    def __init__(
+        self,
+        layout: Layout,
+        basis: StackedBasis,
+        rate: float,
+        weights: Tensor,
+        phase_velocity: Tensor,
+        residual_variance: Tensor,
+        residual_correlation_time: Tensor,
+        value_variance: Tensor,
+        longest_repeat: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        self.layout = layout
+        self.basis = basis
+        self.rate = rate
+        self.register_buffer("weights", owned(weights))
+        self.register_buffer("phase_velocity", owned(phase_velocity))
+        self.register_buffer("residual_variance", owned(residual_variance))
+        self.register_buffer("residual_correlation_time", owned(residual_correlation_time))
+        self.register_buffer("value_variance", owned(value_variance))
+        repeat = weights.new_zeros(len(layout.names)) if longest_repeat is None else longest_repeat
+        self.register_buffer("longest_repeat", owned(repeat))
+
+    @classmethod
+    @in_own_modes
+    def fit(cls, demonstrations: Demonstrations, basis: StackedBasis | None = None) -> InteractionPrimitive:
+        """Batched least squares (float64) of all demonstrations and DoFs, tolerant of missing samples.
+
+        Args:
+            demonstrations: at least two.
+            basis: default: `select_basis(demonstrations)`.
+
+        Returns:
+            A primitive in the dtype and on the device of the demonstrations.
+
+        Raises:
+            ValueError: one demonstration only; a basis for another number of DoFs; a demonstration shorter
+                than its basis has functions; a DoF that was never measured.
+        """
+        if len(demonstrations) < 2:
+            raise ValueError("a primitive needs at least 2 demonstrations to have a spread, got 1")
+        basis = select_basis(demonstrations) if basis is None else basis
+        if not isinstance(basis, StackedBasis):
+            raise ValueError(f"basis must be a StackedBasis, one basis for each DoF, got {type(basis).__name__}")
+        layout = demonstrations.layout
+        if basis.n_dofs != layout.n_dofs:
+            raise ValueError(f"the basis is for {basis.n_dofs} DoFs, the demonstrations have {layout.n_dofs}")
+        largest = max(part.n_features for part in basis.bases)
+        for index, trajectory in enumerate(demonstrations):
+            if len(trajectory) < largest:
+                raise ValueError(
+                    f"demonstration {index} has {len(trajectory)} samples, fewer than the {largest} functions "
+                    "of the basis"
+                )
+        samples = samples_of(demonstrations)
+        resolution = torch.finfo(demonstrations[0].dtype).eps
+        weights = samples.values.new_empty(len(demonstrations), basis.n_weights)
+        variance = samples.values.new_empty(layout.n_dofs)
+        correlation = samples.values.new_empty(layout.n_dofs)
+        for unique in dict.fromkeys(basis.bases):
+            dofs = [d for d, other in enumerate(basis.bases) if other == unique]
+            part = Samples(samples.phase, *(tensor[..., dofs] for tensor in samples[1:]))
+            fit = regress(unique, part)
+            for i, dof in enumerate(dofs):
+                weights[:, basis.weight_slices[dof]] = fit.weights[:, i]
+            variance[dofs] = mean_squared_residual(fit, part).nanmean(0)
+            correlation[dofs] = correlation_time(fit, part)
+        spread = measured_variance(samples, resolution)
+        # A DoF that is fitted exactly would have R = 0, and with it a singular innovation covariance. What floor is
+        # small depends on its unit, which its spread tells, its size if it never moves, and nothing if it is 0.
+        size = torch.where(samples.observed, samples.values, 0).square().amax((0, 1))
+        variance = torch.maximum(variance, torch.where(spread > 0, 1e-10 * spread, 1e-12 * size))
+        variance = torch.where(variance > 0, variance, 1e-12)
+        dtype = demonstrations[0].dtype
+        velocity = 1 / demonstrations.durations.to(weights)
+        repeats = longest_repeats(demonstrations).to(weights.device)
+        tensors: Sequence[Tensor] = (weights, velocity, variance, correlation, spread, repeats)
+        return cls(layout, basis, demonstrations.rate, *(tensor.to(dtype) for tensor in tensors))
+
+    def extra_repr(self) -> str:
+        """Sizes, and what the columns are."""
+        return f"demonstrations={len(self)}, {self.meant()}"
+
+    def meant(self) -> str:
+        """What its tensors mean, see `Meaning`."""
+        dofs = zip(self.layout.dofs, self.layout.units, self.layout.controlled.tolist(), strict=True)
+        columns = (f"{dof} [{unit}]{' controlled' if controlled else ''}" for dof, unit, controlled in dofs)
+        return f"rate={self.rate:.9g}, dofs={', '.join(columns)}"
+
+    def __len__(self) -> int:
+        return len(self.weights)
+
+    @property
+    def correlated_residual_variance(self) -> Tensor:
+        """[D]: a corrected closed form, `residual_variance` times `residual_correlation_time`.
+
+        The paper takes the residual for white noise; it is misfit of the basis, correlated over many samples,
+        so a filter that believes R draws the same information again and again. n samples with integrated
+        autocorrelation time tau carry what n / tau independent ones would.
+        """
+        return self.residual_variance * self.residual_correlation_time
+
+    @property
+    def end_variance(self) -> Tensor:
+        """[D]: variance over demonstrations of the value at phase 1."""
+        one = torch.ones(len(self), dtype=self.weights.dtype, device=self.weights.device)
+        return self.basis.project(one, self.weights - self.weights.mean(0)).var(0)
+
+    def subset(self, indices: Sequence[int] | Sequence[bool] | Tensor) -> InteractionPrimitive:
+        """The same basis and noise with some of the demonstrations: they need no new regression.
+
+        Args:
+            indices: [M], which ones, negative ones from the end; or a mask, bool [N].
+
+        Raises:
+            ValueError: an index out of range, a mask of another length, fractions.
+        """
+        indices = as_indices("demonstration", indices, len(self)).to(self.weights.device)
+        return InteractionPrimitive(
+            self.layout,
+            self.basis,
+            self.rate,
+            self.weights[indices],
+            self.phase_velocity[indices],
+            self.residual_variance,
+            self.residual_correlation_time,
+            self.value_variance,
+            self.longest_repeat,
+        )

@@ -1,0 +1,52 @@
+"""Which interactions are tuned on and which decide when to stop; and ensembles that do not know the answer."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torch_ebip.learning.settings import TuningSettings
+
+
+class Partition:
+    """Demonstrations cut into training and validation, and into folds whose ensembles are the other folds.
+
+    Args:
+        count: of the demonstrations.
+        settings: shares, folds, seed and size of ensembles.
+
+    Attributes:
+        training, validating: int64, which demonstrations.
+
+    Raises:
+        ValueError: fewer than two folds, or too few demonstrations for them.
+    """
+
+    def __init__(self, count: int, settings: TuningSettings) -> None:
+        held = max(1, round(settings.validation * count))
+        if settings.folds < 2 or count - held < 1 or count < 2 * settings.folds:
+            raise ValueError(f"{count} demonstrations are too few for {settings.folds} folds and validation")
+        order = torch.randperm(count, generator=torch.Generator("cpu").manual_seed(settings.seed), device="cpu")
+        self.validating, self.training = order[:held], order[held:]
+        part = torch.empty(count, dtype=torch.long, device="cpu")
+        part[order] = torch.arange(count, device="cpu") % settings.folds
+        others = [(part != fold).nonzero().squeeze(-1) for fold in range(settings.folds)]
+        size = min(len(group) for group in others)
+        self._part, self._others = part, torch.stack([group[:size] for group in others])
+        self._size = settings.n_members
+
+    def members(self, interactions: Tensor, generator: torch.Generator) -> Tensor:
+        """Indices [B, E] of demonstrations outside the fold of each of some interactions, int64 [B]."""
+        others, size = self._others[self._part[interactions]], self._size
+        if size is None or size == others.shape[1]:
+            return others
+        if size > others.shape[1]:
+            return others.gather(
+                1, torch.randint(others.shape[1], (len(others), size), generator=generator, device="cpu")
+            )
+        return others.gather(1, torch.rand(others.shape, generator=generator, device="cpu").argsort(-1)[:, :size])
+
+
+def generator_of(seed: int, step: int) -> torch.Generator:
+    """A generator for each step of a seed; neighbouring steps and seeds do not share streams."""
+    return torch.Generator("cpu").manual_seed((seed * 1_000_003 + step * 7_919 + 17) % (2**63))

@@ -1,0 +1,283 @@
+"""One live interaction: sensors push what they have when they have it, the robot asks what is to come.
+
+Time is cut into ticks as far apart as the demonstrations' samples. A filter takes in one tick after the other, each
+with the sample of every sensor that was taken nearest to it. A sample that arrives late belongs to a tick that is
+past: the filter is wound back to the tick before and takes in again what followed (fixed-lag replay), with the draws
+it had. So the state depends on what was measured and when, never on the order in which it arrived nor on when
+somebody asked.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+from collections.abc import Sequence
+from dataclasses import asdict
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import torch
+
+from torch_ebip.common.ambient import in_own_modes
+from torch_ebip.interaction.filters import InteractionFilter
+from torch_ebip.interaction.primitive import InteractionPrimitive
+from torch_ebip.live.engine import make_engine
+from torch_ebip.live.forecast import SessionForecast
+from torch_ebip.live.intake import Freshness, Intake, SensorReport, as_number, as_vector, training_ranges
+from torch_ebip.live.log import SessionLog, fingerprint
+from torch_ebip.live.settings import SessionSettings, patience_of
+
+TOLERANCE = 1e-3
+"""Ticks by which a time may be short of a tick and still be it: clocks that count from 1970 round to microseconds."""
+
+
+class InteractionSession:
+    """Filters one interaction as it happens. Bad sensor values never raise: they are refused and counted.
+
+    Its methods may be called from several threads; they wait for each other.
+
+    Args:
+        filter: of the primitive, tuned or not: any kind. Not changed, and not to be changed while the session lasts.
+        primitive: whose layout names sensors and controlled DoFs, and whose demonstrations say what is plausible.
+        sensors: names of the modalities that will be pushed; default: all that are not controlled.
+        settings: how to treat them; default: `SessionSettings()`.
+        record: file to write everything to that is pushed and asked, for `replay`; must not exist.
+
+    Raises:
+        ValueError: a sensor that the layout does not have, that is controlled or named twice; no controlled DoF; a
+            filter of other DoFs, in another order, or at another rate.
+        FileExistsError, OSError: the recording cannot be written.
+    """
+
+    @in_own_modes
+    def __init__(
+        self,
+        filter: InteractionFilter,
+        primitive: InteractionPrimitive,
+        sensors: Sequence[str] | None = None,
+        settings: SessionSettings | None = None,
+        record: str | os.PathLike[str] | None = None,
+    ) -> None:
+        layout = primitive.layout
+        if filter.n_dofs != layout.n_dofs:
+            raise ValueError(f"the filter has {filter.n_dofs} DoFs, the primitive's layout {layout.n_dofs}")
+        if filter.dof_names is not None and filter.dof_names != layout.dofs:
+            pairs = zip(filter.dof_names, layout.dofs, strict=True)
+            first = next((ours, theirs) for ours, theirs in pairs if ours != theirs)
+            raise ValueError(f"the filter and the primitive have other columns: {first[0]!r} and {first[1]!r}")
+        if abs(filter.dt * primitive.rate - 1) > 1e-6:
+            raise ValueError(f"the filter takes {1 / filter.dt:g} samples a second, the primitive {primitive.rate:g}")
+        if not bool(layout.controlled.any()):
+            raise ValueError(f"nothing to forecast: no modality of {', '.join(layout.names)} is controlled")
+        if sensors is None:
+            sensors = [modality.name for modality in layout.modalities if not modality.controlled]
+        if isinstance(sensors, str) or len(set(sensors)) != len(sensors):
+            raise ValueError(f"sensors must be different names of modalities, got {sensors!r}")
+        for name in sensors:
+            if layout[name].controlled:
+                raise ValueError(f"{name!r} is controlled by the robot, not a sensor")
+        if not sensors:
+            raise ValueError("a session needs at least one sensor")
+        self.settings = settings = SessionSettings() if settings is None else settings
+        self.sensors, self.dt = tuple(sensors), filter.dt
+        self.dofs = tuple(dof for dof, ours in zip(layout.dofs, layout.controlled.tolist(), strict=True) if ours)
+        self._patience = patience_of(settings.frozen_after, primitive, self.sensors)
+        self._numbers = {name: i for i, name in enumerate(self.sensors)}
+        # A sample may belong to a tick half a tick before it was taken.
+        behind = math.floor(settings.window / self.dt + 0.5 + TOLERANCE) + 1
+        self._intake = Intake(
+            [layout.slice(name) for name in self.sensors],
+            training_ranges(primitive, settings.margin),
+            settings.start,
+            self.dt,
+            behind,
+            math.ceil(settings.longest_gap / self.dt),
+        )
+        self._slots = behind + 2
+        self._engine = make_engine(filter, layout.mask(self.sensors), layout.controlled, self._slots, settings.seed)
+        self._like = next(filter.parameters())
+        self._freshness = [self._intake.fresh() for _ in range(self._slots)]
+        self._engine.save(-1 % self._slots)
+        self._head, self._dirty, self._ticks = -1, 0, 0
+        self._now = self._newest = settings.start
+        self._lock = threading.RLock()
+        self._log: SessionLog | None = None
+        if record is not None:
+            header = {
+                "filter": fingerprint(filter),
+                "primitive": fingerprint(primitive),
+                "sensors": list(self.sensors),
+                "settings": asdict(settings),
+            }
+            self._log = SessionLog(record, header)
+
+    def push(self, sensor: str, values: Any, time: Any) -> None:
+        """Take a sample of a sensor; costs microseconds, the filter does its work when it is asked.
+
+        Args:
+            sensor: name of a modality.
+            values: one number for each of its DoFs, in their units; NaN = not measured.
+            time: when it was taken, s.
+
+        Raises:
+            ValueError: no such sensor. Nothing else: see `report`.
+        """
+        number = self._numbers.get(sensor)
+        if number is None:
+            raise ValueError(f"no sensor {sensor!r}; this session has {', '.join(self.sensors)}")
+        with self._lock:
+            if self._log is not None:
+                columns = self._intake.columns[number]
+                vector = as_vector(values, columns.stop - columns.start)
+                self._log.write(["push", sensor, as_number(time), None if vector is None else vector.tolist()])
+            tick = self._intake.put(number, values, time, self._head)
+            self._newest = max(self._newest, self._intake.reports[number].last)
+            if tick is not None:
+                self._dirty = min(self._dirty, tick)
+
+    @in_own_modes
+    def advance(self, now: float | None = None) -> None:
+        """Filter up to the present.
+
+        Args:
+            now: the present, s; default: the newest time of any sample. It never runs backwards.
+
+        Raises:
+            ValueError: it is not finite, or further ahead than ``longest_gap``.
+        """
+        now = _plain(now)
+        with self._lock:
+            self._advance(now)
+            if self._log is not None:
+                self._log.write(["advance", now])
+
+    @in_own_modes
+    def forecast(self, horizon: float | Sequence[float] | None = None, now: float | None = None) -> SessionForecast:
+        """Filter up to the present, and say what the controlled DoFs should be.
+
+        Args:
+            horizon: seconds from now, one or several; default: the end of the interaction, phase 1. What lies
+                behind the end is the end.
+            now: see `advance`.
+
+        Raises:
+            ValueError: see `advance`; a horizon that is not finite.
+        """
+        now = _plain(now)
+        several = horizon is not None and np.ndim(horizon) > 0
+        horizons = [] if horizon is None else np.atleast_1d(np.asarray(horizon, dtype=np.float64)).tolist()
+        if not all(math.isfinite(h) for h in horizons):
+            raise ValueError(f"horizons must be finite numbers of seconds, got {horizons}")
+        with self._lock:
+            self._advance(now)
+            phase, velocity = self._engine.clock()
+            # Since the last tick the interaction went on.
+            phase += velocity * (self._now - self._time(max(self._head, 0)))
+            phases = [1.0] if horizon is None else [min(max(phase + velocity * h, 0.0), 1.0) for h in horizons]
+            expected = self._engine.forecast(self._like.new_tensor(phases))
+            mean, deviation = expected.mean, expected.variance.sqrt()
+            if self._log is not None:
+                asked = horizons if several else horizons[0] if horizons else None
+                self._log.write(["forecast", now, asked, mean.tolist()])
+            if not several:
+                mean, deviation = mean[0], deviation[0]
+            phase = min(max(phase, 0.0), 1.0)
+            left = (1 - phase) / velocity if velocity > 0 else math.inf
+            return SessionForecast(self._now, phase, left, self.dofs, mean, deviation, self._stale())
+
+    @property
+    def failed_updates(self) -> int:
+        """How many ticks were left out because the filter could not take them in."""
+        with self._lock:
+            return self._current().failed
+
+    @property
+    def ticks_filtered(self) -> int:
+        """How many ticks the filter was led through so far, those that late samples made it repeat included."""
+        with self._lock:
+            return self._ticks
+
+    def report(self) -> dict[str, SensorReport]:
+        """What became of everything that was pushed, by sensor."""
+        with self._lock:
+            return dict(zip(self.sensors, self._intake.report(self._current()), strict=True))
+
+    def close(self) -> None:
+        """End the recording, if there is one."""
+        with self._lock:
+            if self._log is not None:
+                self._log.close()
+
+    def __enter__(self) -> InteractionSession:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _current(self) -> Freshness:
+        return self._freshness[self._head % self._slots]
+
+    def _time(self, tick: int) -> float:
+        return self.settings.start + tick * self.dt
+
+    def _stale(self) -> tuple[str, ...]:
+        oldest = self._now - self.settings.stale_after
+        used = self._current().used.tolist()
+        return tuple(
+            name for name, tick in zip(self.sensors, used, strict=True) if tick < 0 or self._time(tick) < oldest
+        )
+
+    def _advance(self, now: float | None) -> None:
+        if now is not None:
+            if not math.isfinite(now):
+                raise ValueError(f"now must be a finite time in seconds, got {now}")
+            gap = now - self._time(max(self._head, 0))
+            if gap > self.settings.longest_gap:
+                raise ValueError(
+                    f"now = {now} s is {gap:.1f} s after what was filtered last, more than the longest gap of "
+                    f"{self.settings.longest_gap} s; begin a new session"
+                )
+        self._now = max(self._now, self._newest if now is None else now)
+        newest = math.floor((self._now - self.settings.settle - self.settings.start) / self.dt + TOLERANCE)
+        if self._dirty <= self._head:
+            self._head = self._dirty - 1
+            self._engine.load(self._head % self._slots)
+        while self._head < newest:
+            self._step()
+        self._dirty = self._head + 1
+
+    def _step(self) -> None:
+        """One more tick."""
+        freshness = self._current().copy()
+        self._head += 1
+        self._ticks += 1
+        if self._head > 0:
+            self._engine.predict()
+        values, usable = self._intake.usable(self._head, freshness, self._patience)
+        if usable.any():
+            y = torch.as_tensor(values, dtype=self._like.dtype, device=self._like.device)
+            try:
+                self._engine.update(y, tuple(usable.tolist()))
+                done = self._engine.finite()
+            except ValueError:
+                done = False
+            if not done:
+                # Back to before the tick: this one is left out, as if nothing had been measured.
+                freshness.failed += 1
+                self._engine.load((self._head - 1) % self._slots)
+                if self._head > 0:
+                    self._engine.predict()
+        self._freshness[self._head % self._slots] = freshness
+        self._engine.save(self._head % self._slots)
+
+
+def _plain(now: float | None) -> float | None:
+    """A float, whatever library the number is from."""
+    try:
+        return None if now is None else float(now)
+    except (OverflowError, TypeError, ValueError) as error:
+        raise ValueError(f"now must be a finite time in seconds, got {str(now)[:40]}") from error

@@ -1,0 +1,171 @@
+"""Demonstrations: ragged recordings of one interaction, all on one layout."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from torch_ebip.common.ambient import outside_inference, own_modes
+from torch_ebip.common.arguments import as_count, as_indices, as_number, as_values
+from torch_ebip.recordings.arrays import LIMIT, Array, Recordings, read_npz, write_npz
+from torch_ebip.recordings.folders import CSV_LIMIT, read_folder
+from torch_ebip.recordings.layout import Layout
+
+
+class Demonstrations:
+    """N recordings of an interaction from its beginning (phase 0) to its end (phase 1).
+
+    Args:
+        layout: what the D columns are.
+        trajectories: N tensors [T_i, D] in the units of the layout, sampled evenly; NaN = not measured. Arrays, lists
+            and data frames (whose columns are taken by the layout's names) are taken as well. They are data: a graph
+            that they carry is left behind.
+        rate: samples a second, Hz.
+        columns: further facts, one row a demonstration (release times, names), kept under their names.
+
+    Raises:
+        ValueError: no demonstration; a trajectory that is not [T >= 2, D], has no measured value or an
+            infinite one; a rate that is not a positive number; a column without N rows.
+    """
+
+    def __init__(
+        self,
+        layout: Layout,
+        trajectories: Sequence[Tensor | npt.ArrayLike],
+        rate: float,
+        columns: Mapping[str, Array] | None = None,
+    ) -> None:
+        rate = as_number("rate", rate, 0, above=True, of="of samples a second")
+        if len(trajectories) == 0:
+            raise ValueError("at least one demonstration is needed, got none")
+        self.layout = layout
+        self.rate = rate
+        self.trajectories = tuple(_checked(i, trajectory, layout) for i, trajectory in enumerate(trajectories))
+        if len({(trajectory.dtype, trajectory.device) for trajectory in self.trajectories}) > 1:
+            raise ValueError("all trajectories must have one dtype and live on one device")
+        self.columns = {name: np.asarray(column) for name, column in (columns or {}).items()}
+        for name, column in self.columns.items():
+            if column.shape[:1] != (len(self),):
+                raise ValueError(
+                    f"column {name!r} has shape {column.shape}, expected {len(self)} rows, one a demonstration"
+                )
+
+    def __len__(self) -> int:
+        return len(self.trajectories)
+
+    def __getitem__(self, index: int) -> Tensor:
+        """The trajectory [T_i, D] of one demonstration."""
+        return self.trajectories[index]
+
+    def __iter__(self) -> Iterator[Tensor]:
+        return iter(self.trajectories)
+
+    def __repr__(self) -> str:
+        return (
+            f"Demonstrations({len(self)} of {int(self.lengths.min())} to {int(self.lengths.max())} samples "
+            f"at {self.rate:g} Hz, {self.layout.n_dofs} DoFs: {', '.join(self.layout.names)})"
+        )
+
+    @property
+    def lengths(self) -> Tensor:
+        """int64 [N]: T_i, the number of samples of each."""
+        return torch.tensor([len(trajectory) for trajectory in self.trajectories], device="cpu")
+
+    @property
+    def durations(self) -> Tensor:
+        """[N] seconds: T_i samples last (T_i - 1) / rate."""
+        dtype = self.trajectories[0].dtype
+        return (self.lengths.to(dtype) - 1) / self.rate
+
+    def subset(self, indices: Sequence[int] | Sequence[bool] | Tensor) -> Demonstrations:
+        """Some of the demonstrations, with their columns.
+
+        Args:
+            indices: [M], which ones, negative ones from the end; or a mask, bool [N].
+
+        Raises:
+            ValueError: an index out of range, a mask of another length, fractions; none chosen.
+        """
+        chosen = as_indices("demonstration", indices, len(self)).tolist()
+        columns = {name: column[chosen] for name, column in self.columns.items()}
+        return Demonstrations(self.layout, [self.trajectories[i] for i in chosen], self.rate, columns)
+
+    def folds(self, k: int, generator: torch.Generator | None = None) -> list[tuple[Tensor, Tensor]]:
+        """Shuffle once and cut into k parts: (training, test) indices int64 [M], sizes differing by at most one.
+
+        Args:
+            k: how many folds.
+            generator: of the shuffle.
+
+        Raises:
+            ValueError: k is not between 2 and the number of demonstrations.
+        """
+        if not 2 <= as_count("folds", k) <= len(self):
+            raise ValueError(f"folds must be between 2 and the {len(self)} demonstrations there are, got {k}")
+        parts = torch.randperm(len(self), generator=generator, device="cpu").tensor_split(k)
+        return [(torch.cat([*parts[:i], *parts[i + 1 :]]), parts[i]) for i in range(k)]
+
+    def pad(self) -> tuple[Tensor, Tensor]:
+        """One batch: values [N, T, D] (NaN where not measured or past the end) and observed, bool [N, T, D]."""
+        values = torch.nn.utils.rnn.pad_sequence(list(self.trajectories), batch_first=True, padding_value=math.nan)
+        return values, ~values.isnan()
+
+    def to(self, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Demonstrations:
+        """The same demonstrations in another dtype or on another device."""
+        moved = [trajectory.to(dtype=dtype, device=device) for trajectory in self.trajectories]
+        return Demonstrations(self.layout, moved, self.rate, self.columns)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write one ``.npz`` (values in float32, never pickled), which `load` reads; atomic.
+
+        Raises:
+            ValueError: see `recordings.write_npz`.
+        """
+        arrays = [trajectory.detach().cpu().numpy() for trajectory in self.trajectories]
+        write_npz(path, Recordings(self.layout, arrays, self.rate, self.columns))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], limit: int = LIMIT) -> Demonstrations:
+        """Read a ``.npz`` of at most so many bytes; executes nothing of it.
+
+        Errors: see `arrays.read_npz` and `Demonstrations`.
+        """
+        return cls._from_recordings(path, read_npz(path, limit))
+
+    @classmethod
+    def load_folder(cls, path: str | os.PathLike[str], limit: int = CSV_LIMIT) -> Demonstrations:
+        """Read a folder of CSV files beside a ``layout.toml`` or ``layout.json``: see `folders.read_folder`."""
+        return cls._from_recordings(path, read_folder(path, limit))
+
+    @classmethod
+    def _from_recordings(cls, path: str | os.PathLike[str], recordings: Recordings) -> Demonstrations:
+        tensors = [torch.from_numpy(np.ascontiguousarray(array)) for array in recordings.trajectories]
+        try:
+            return cls(recordings.layout, tensors, recordings.rate, recordings.columns)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+
+
+def _checked(index: int, given: Tensor | npt.ArrayLike, layout: Layout) -> Tensor:
+    name = f"demonstration {index}"
+    with own_modes(inference=True):
+        trajectory = outside_inference(as_values(name, given, layout.dofs).detach())
+    if trajectory.ndim != 2 or trajectory.shape[1] != layout.n_dofs:
+        raise ValueError(
+            f"{name} has shape {tuple(trajectory.shape)}, expected [T, {layout.n_dofs}]: one column for each of "
+            f"{', '.join(layout.names)}"
+        )
+    if len(trajectory) < 2:
+        raise ValueError(f"{name} has {len(trajectory)} samples, at least 2 are needed")
+    if trajectory.isnan().all():
+        raise ValueError(f"{name} has no measured value: all of it is NaN")
+    if trajectory.isinf().any():
+        dof = layout.dofs[int(trajectory.isinf().any(0).nonzero()[0])]
+        raise ValueError(f"{name} has infinite values in {dof}; mark what was not measured as NaN")
+    return trajectory
