@@ -19,11 +19,13 @@ class Problem(NamedTuple):
 
     Attributes:
         filter: the paper's eBIP.
+        weighted: the same with members weighed by evidence.
         sensors: bool [D], the DoFs that are measured.
         y: [T, D], an interaction from its beginning to nine tenths of it, with noise.
     """
 
     filter: EnsembleFilter
+    weighted: EnsembleFilter
     sensors: Tensor
     y: Tensor
 
@@ -51,7 +53,7 @@ def make_problem(
     velocity = (1 + 0.05 * torch.randn(members + 1, generator=generator)) / duration
     basis, one = StackedBasis([GaussianBasis(FUNCTIONS)] * dofs), torch.ones(dofs)
     known = [tensor.to(dtype) for tensor in (weights[1:], velocity[1:], 0.01 * one, one, one)]
-    filter = ebip(InteractionPrimitive(layout, basis, RATE, *known))
+    primitive = InteractionPrimitive(layout, basis, RATE, *known)
     y = basis.project(torch.arange(samples) / RATE * velocity[0], weights[0])
     y = y + 0.1 * torch.randn(y.shape, generator=generator)
-    return Problem(filter, layout.mask(["sensors"]), y.to(dtype))
+    return Problem(ebip(primitive), ebip(primitive, weigh=True), layout.mask(["sensors"]), y.to(dtype))

@@ -17,6 +17,8 @@ from experiments.timing import Timing, interleaved, threads
 
 BATCH = 22
 """Interactions of a test fold."""
+OTHERS = ("live, batch", "live, weighted")
+"""Versions that do something else than `filter`: they are compared with it in the tests of the live path."""
 SLOW = {"loop": 7, "filterpy": 37}
 """Versions that take part in every k-th round only; no divisors of an interaction's length, to see all of it."""
 
@@ -40,6 +42,7 @@ def make(name: str, problem: Problem, seed: int, given: bool = False) -> Version
     builders: Mapping[str, Callable[[], Version]] = {
         "live": lambda: Live(problem, generator),
         "live, batch": lambda: Live(problem, generator, BATCH),
+        "live, weighted": lambda: Live(problem, generator, weigh=True),
         "filter": lambda: Module(problem, generator),
         "loop": lambda: Loop(problem, draw),
         "numpy": lambda: Numpy(problem, draw_array),
@@ -50,8 +53,6 @@ def make(name: str, problem: Problem, seed: int, given: bool = False) -> Version
 
 def check(problem: Problem, names: list[str], steps: int = 5) -> dict[str, float]:
     """Largest difference of members from `EnsembleFilter`'s after some steps with the same draws, float64.
-
-    A batch has draws of its own: it is compared in the tests of the live path.
 
     Raises:
         RuntimeError: a version that does not do the same; there is no point in timing it.
@@ -102,10 +103,10 @@ def live_size(rounds: int, seed: int) -> list[dict[str, Any]]:
     """The paper's live size, 1 thread, against everything there is: a row for each version."""
     rows = []
     for sensors in (10, 43):
-        names = ["live", "live, batch", "filter", "loop", "numpy"]
+        names = ["live", "live, batch", "live, weighted", "filter", "loop", "numpy"]
         names += ["filterpy"] if find_spec("filterpy") else []
         differences = check(
-            make_problem(559, 80, sensors, torch.float64, seed=seed), [n for n in names if n != "live, batch"]
+            make_problem(559, 80, sensors, torch.float64, seed=seed), [n for n in names if n not in OTHERS]
         )
         problem = make_problem(559, 80, sensors, torch.float32, seed=seed)
         with threads(1):

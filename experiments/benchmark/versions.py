@@ -56,8 +56,9 @@ class Constants:
 class Live:
     """`LiveFilter`."""
 
-    def __init__(self, problem: Problem, generator: torch.Generator, batch: int = 0) -> None:
-        self.live = LiveFilter(problem.filter, problem.sensors, (batch,) if batch else (), generator=generator)
+    def __init__(self, problem: Problem, generator: torch.Generator, batch: int = 0, weigh: bool = False) -> None:
+        filter = problem.weighted if weigh else problem.filter
+        self.live = LiveFilter(filter, problem.sensors, (batch,) if batch else (), generator=generator)
         self.observed = problem.sensors.expand(*self.live.batch_shape, -1)
         self.y = self.observed.new_zeros(self.observed.shape, dtype=problem.y.dtype)
         self.first = int(problem.sensors.sum())

@@ -106,6 +106,11 @@ class StateSpace(nn.Module):
         dofs: names of the DoFs, for error messages; or their number D.
         dt: seconds between samples where none is given.
 
+    Attributes:
+        leading: m, how many leading entries the dynamics move; None for all of them, as of dynamics that do not say.
+        moving: how many leading entries move or are stirred, the rest stands still; None for all, or if nobody says.
+        noise_depends_on_state: whether R changes during a sequence; assumed of noises that do not say.
+
     Raises:
         ValueError: no DoF, a dt that is not a positive number of seconds, a measurement noise of another width.
 
@@ -117,6 +122,10 @@ class StateSpace(nn.Module):
         ...         return x
         >>> model = StateSpace(Still(), Still(), None, MeasurementNoise(torch.ones(2)), ("x", "y"), dt=0.1)
     """
+
+    leading: int | None
+    moving: int | None
+    noise_depends_on_state: bool
 
     def __init__(
         self,
@@ -145,16 +154,20 @@ class StateSpace(nn.Module):
                     f"the model has {self.n_dofs}"
                 )
 
-    @property
-    def leading(self) -> int | None:
-        """m, how many leading entries the dynamics move; None for all of them, as of dynamics that do not say."""
-        return self.dynamics.moving if isinstance(self.dynamics, Moves) else None
+    def __setattr__(self, name: str, value: Any) -> None:
+        super().__setattr__(name, value)
+        if name in ("dynamics", "process_noise", "measurement_noise") and "measurement_noise" in self._modules:
+            self._ask_parts()
 
-    @property
-    def moving(self) -> int | None:
-        """How many leading entries move or are stirred, the rest stands still; None for all, or if nobody says."""
-        stirred = self.process_noise.moving if isinstance(self.process_noise, Moves) else None
-        return None if self.leading is None or stirred is None else max(self.leading, stirred)
+    def _ask_parts(self) -> None:
+        """What parts say of themselves, asked once when they are put in: a protocol takes longer than a product."""
+        dynamics, noise, measured = self.dynamics, self.process_noise, self.measurement_noise
+        self.leading = dynamics.moving if isinstance(dynamics, Moves) else None
+        stirred = noise.moving if isinstance(noise, Moves) else None
+        self.moving = None if self.leading is None or stirred is None else max(self.leading, stirred)
+        self.noise_depends_on_state = measured.depends_on_state if isinstance(measured, SaysWhatItDependsOn) else True
+        new = isinstance(dynamics, MakesNewMembers) and dynamics.makes_new_members
+        self._adds_in_place = new and isinstance(noise, AddsInPlace)
 
     @property
     def leaves_span(self) -> str | None:
@@ -181,7 +194,7 @@ class StateSpace(nn.Module):
         Raises:
             ValueError: a measurement that gives another number of values than there are DoFs.
         """
-        if isinstance(self.measurement, Rows) and self.leading is not None:
+        if self.leading is not None and isinstance(self.measurement, Rows):
             moving, still = self.split(members)
             centre = None if centre is None or not bool(centre.any()) else centre[..., self.leading :]
             return self.measurement.rows(moving, still, None if rows is None else rows.tolist(), centre)
@@ -207,17 +220,9 @@ class StateSpace(nn.Module):
     def advance(self, members: Tensor, dt: Tensor, generator: Generators) -> Tensor:
         """g(x) + N(0, Q): members [..., E, n] after dt [...] seconds, drawn with a generator."""
         moved: Tensor = self.dynamics(members, dt)
-        noise = self.process_noise
-        new = isinstance(self.dynamics, MakesNewMembers) and self.dynamics.makes_new_members
-        if new and isinstance(noise, AddsInPlace):
-            return noise.add_(moved, dt, generator)
-        return noise(moved, dt, generator)  # type: ignore[no-any-return]
-
-    @property
-    def noise_depends_on_state(self) -> bool:
-        """Whether R changes during a sequence; assumed of noises that do not say."""
-        noise = self.measurement_noise
-        return noise.depends_on_state if isinstance(noise, SaysWhatItDependsOn) else True
+        noise: Any = self.process_noise
+        add = noise.add_ if self._adds_in_place else noise
+        return add(moved, dt, generator)  # type: ignore[no-any-return]
 
     def deviation(self, moving: Tensor | None) -> Tensor:
         """Standard deviations of a sample, [D] or [..., D], units of the DoFs.

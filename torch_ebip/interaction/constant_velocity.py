@@ -30,7 +30,7 @@ class ConstantVelocityPhase(PhaseModel):
 
     def rate(self, moving: Tensor) -> Tensor:
         """Phase velocity [...], 1/s, of what moves [..., 2]."""
-        return moving[..., 1]
+        return moving.select(-1, 1)
 
     def first(self, primitive: InteractionPrimitive) -> Tensor:
         """Phase 0 and the phase velocity of each demonstration, [N, 2]."""

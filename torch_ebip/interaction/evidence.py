@@ -12,19 +12,19 @@ Where the demonstrations are comes from a `DemonstrationTable`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torch_ebip.common.ambient import owned
 from torch_ebip.common.arguments import as_number
-from torch_ebip.common.modules import sharing
+from torch_ebip.common.modules import Versions, sharing
 from torch_ebip.filtering.model import StateSpace, View
 from torch_ebip.filtering.noise.constraints import Positive
 from torch_ebip.filtering.updates.weighting import Seen, Weighting
-from torch_ebip.interaction.table import DemonstrationTable
+from torch_ebip.interaction.table import KEPT, DemonstrationTable
 from torch_ebip.recordings.layout import Layout
 
 
@@ -40,6 +40,22 @@ class Evidence(NamedTuple):
     weights: Tensor
     misfit: Tensor
     seen: Tensor
+
+
+class _Constants(NamedTuple):
+    """What depends on parameters alone.
+
+    Attributes:
+        scale: [k], of squared distances, divided by k.
+        sharpness: [], half of it.
+        slope: [].
+        prior: [O], logarithms of the shares of the offsets.
+    """
+
+    scale: Tensor
+    sharpness: Tensor
+    slope: Tensor
+    prior: Tensor
 
 
 class EvidenceWeighting(Weighting):
@@ -109,6 +125,13 @@ class EvidenceWeighting(Weighting):
         self.wander = Positive(variance.new_tensor(wander))
         self.register_buffer("offsets", owned(variance.new_tensor(offsets)))
         self.defensive = defensive
+        self._forget_kept()
+
+    def _forget_kept(self) -> None:
+        self._kept: dict[tuple[int, ...] | None, _Constants] = {}
+        self._versions = Versions(self)
+        self._discounted: tuple[Tensor, Tensor] | None = None
+        self._forgetting_versions = Versions(self.forgetting)
 
     def extra_repr(self) -> str:
         """What is not learned."""
@@ -125,6 +148,7 @@ class EvidenceWeighting(Weighting):
         part.table = self.table.select(view)
         part.register_buffer("variance", self.variance[view.dofs])
         part.register_buffer("modality_of_dof", self.modality_of_dof[view.dofs])
+        part._forget_kept()
         return part
 
     def named_values(self, layout: Layout) -> dict[str, float]:
@@ -147,12 +171,20 @@ class EvidenceWeighting(Weighting):
 
     def forget(self, memory: Evidence, dt: Tensor) -> Evidence:
         """Discount the past of a memory over dt [...] seconds."""
-        keep = torch.exp(-self.forgetting.value * dt)
-        return memory._replace(misfit=memory.misfit * keep.unsqueeze(-1), seen=memory.seen * keep)
+        keep = self._discount(dt)
+        return Evidence(memory.weights, memory.misfit * keep.unsqueeze(-1), memory.seen * keep)
+
+    def _discount(self, dt: Tensor) -> Tensor:
+        """What is left after dt [...] seconds; kept for the same tensor while the parameters stay as they are."""
+        if torch.is_grad_enabled():
+            return torch.exp(-self.forgetting.value * dt)
+        if self._forgetting_versions.changed() or self._discounted is None or self._discounted[0] is not dt:
+            self._discounted = dt, torch.exp(-self.forgetting.value * dt)
+        return self._discounted[1]
 
     def learn(self, memory: Evidence, seen: Seen) -> Evidence:
         """The memory after a sample that was ``seen``: compared with the demonstrations near the members' phases."""
-        phases = (seen.moving[..., :1] + self.offsets).clamp(0, 1)
+        phases = (seen.moving.narrow(-1, 0, 1) + self.offsets).clamp(0, 1)
         paths = self.table.at(seen.origin, phases, seen.rows)
         return self.compare(memory, paths, seen)
 
@@ -164,32 +196,55 @@ class EvidenceWeighting(Weighting):
             paths: [..., E, O, K], of the demonstrations at the members' phases + `offsets`.
             seen: what was measured.
         """
-        y, observed, rows, trust = seen.y, seen.observed, seen.rows, seen.trust
+        y, observed, trust = seen.y, seen.observed, seen.trust
+        scale, sharpness, slope, prior = self._constants(seen.rows)
+        K = y.shape[-1]
+        if observed is None:
+            difference, share, count = paths - (y if y.ndim == 1 else y[..., None, None, :]), trust, None
+        else:
+            difference = paths - torch.where(observed, y, 0)[..., None, None, :]
+            share = observed.to(scale) if trust is None else torch.where(observed, trust, 0)
+            count = observed.sum(-1, keepdim=True).clamp(min=1)
+        samples: Tensor | float = 1.0
+        if share is not None:
+            share = share / (K if count is None else count)
+            scale, samples = scale * share * K, share.sum(-1)
+        square = difference.square()
+        distance = square @ scale if scale.ndim == 1 else (square @ scale[..., None, :, None]).squeeze(-1)
+        temper = (sharpness * torch.exp(slope * (seen.mean.select(-1, 0) - 0.5))).unsqueeze(-1)
+        likelihood = torch.logsumexp(torch.addcmul(prior, distance, temper.unsqueeze(-1), value=-1), -1)
+        misfit = evidence.misfit - likelihood / temper
+        total = evidence.seen + samples
+        # Less than one sample, where values are not trusted, counts as little as it is: it is not scaled up to one.
+        weights = torch.softmax(misfit * (temper / -total.clamp(min=1).unsqueeze(-1)), dim=-1)
+        weights = (1 - self.defensive) * weights + self.defensive / weights.shape[-1]
+        if observed is not None:
+            weights = torch.where(observed.any(-1).unsqueeze(-1), weights, evidence.weights)
+        return Evidence(weights, misfit, total)
+
+    def _constants(self, rows: Tensor | None) -> _Constants:
+        """What depends on parameters alone, for some DoFs int64 [k]; kept while they stay as they are."""
+        if torch.is_grad_enabled():
+            return self._computed(rows)
+        if self._versions.changed():
+            self._kept.clear()
+        key = None if rows is None else tuple(rows.tolist())
+        if key not in self._kept:
+            if len(self._kept) >= KEPT:
+                self._kept.clear()
+            self._kept[key] = self._computed(rows)
+        return self._kept[key]
+
+    def _computed(self, rows: Tensor | None) -> _Constants:
         variance = self.variance if rows is None else self.variance[rows]
         modality = self.modality_of_dof if rows is None else self.modality_of_dof[rows]
         # A DoF that never moved in the demonstrations says nothing about which of them this is.
         scale = torch.where(variance > 0, self.factor.value[modality] / torch.where(variance > 0, variance, 1), 0)
-        if observed is None:
-            count = y.new_full((*y.shape[:-1], 1), y.shape[-1])
-            difference = paths - y[..., None, None, :]
-        else:
-            count = observed.sum(-1, keepdim=True).clamp(min=1)
-            scale = torch.where(observed, scale, 0)
-            difference = paths - torch.where(observed, y, 0)[..., None, None, :]
-        share = trust
-        if share is None:
-            share = torch.ones_like(y) if observed is None else observed.to(scale)
-        scale = scale * share / count
-        distance = (difference.square() @ scale[..., None, :, None]).squeeze(-1)
-        temper = 0.5 * self.sharpness.value * torch.exp(self.slope.value * (seen.mean[..., 0] - 0.5))
         prior = torch.log_softmax(-0.5 * (self.offsets / self.wander.value).square(), -1)
-        likelihood = torch.logsumexp(prior - distance * temper[..., None, None], -1)
-        misfit = evidence.misfit - likelihood / temper.unsqueeze(-1)
-        samples = evidence.seen + (share.sum(-1) / count.squeeze(-1))
-        # Less than one sample, where values are not trusted, counts as little as it is: it is not scaled up to one.
-        mean = misfit / torch.where(samples > 1, samples, 1).unsqueeze(-1)
-        weights = torch.softmax(-mean * temper.unsqueeze(-1), dim=-1)
-        weights = (1 - self.defensive) * weights + self.defensive / weights.shape[-1]
-        if observed is not None:
-            weights = torch.where(observed.any(-1).unsqueeze(-1), weights, evidence.weights)
-        return Evidence(weights, misfit, samples)
+        return _Constants(scale / len(variance), 0.5 * self.sharpness.value, self.slope.value, prior)
+
+    def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> EvidenceWeighting:
+        """Of `nn.Module`, which calls it to move a module: what was computed before is of another dtype or device."""
+        self._kept.clear()
+        self._discounted = None
+        return super()._apply(fn, recurse)  # type: ignore[no-any-return, no-untyped-call]

@@ -7,6 +7,7 @@ Nothing else in the package knows how many entries move: a phase model of anothe
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import ClassVar
 
 import torch
@@ -31,7 +32,7 @@ class PhaseModel(FastTwins, nn.Module, ABC):
         overrun: how far beyond the interval a phase can get.
     """
 
-    twins: ClassVar[dict[str, tuple[str, ...]]] = {"forward": ("advance_", "moved_covariance", "makes_new_members")}
+    twins: ClassVar[dict[str, tuple[str, ...]]] = {"forward": ("advancer", "moved_covariance", "makes_new_members")}
     makes_new_members: ClassVar[bool] = True
     """Its result is never its argument, so that noise can be added in place."""
 
@@ -63,13 +64,27 @@ class PhaseModel(FastTwins, nn.Module, ABC):
         moved[..., 0] = self.hold(members[..., 0] + self.rate(members[..., : self.moving]) * dt[..., None])
         return moved
 
-    def advance_(self, moving: Tensor, dt: float) -> None:
-        """The same in place for ``moving``, [..., m, E], of members that are columns, over dt seconds."""
-        phase = moving[..., 0, :]
-        phase.add_(self.rate(moving.transpose(-1, -2)), alpha=dt)
-        low, high = torch.aminmax(phase)
-        if float(low) < 0 or float(high) > 1:
-            phase.copy_(self.hold(phase))
+    def advancer(self, moving: Tensor) -> Callable[[float], None]:
+        """The same in place for members that are columns.
+
+        Args:
+            moving: [..., m, E], what moves of them; others hold it, too.
+
+        Returns:
+            A function of dt in seconds.
+        """
+        phase, by_member = moving.select(-2, 0), moving.transpose(-1, -2)
+        rate = self.rate(by_member)
+        follows = rate._is_view() and rate._base is by_member._base  # what is a view changes with what it is of
+
+        def advance(dt: float) -> None:
+            """Advance by dt seconds."""
+            phase.add_(rate if follows else self.rate(by_member), alpha=dt)
+            low, high = torch.aminmax(phase)
+            if float(low) < 0 or float(high) > 1:
+                phase.copy_(self.hold(phase))
+
+        return advance
 
     def hold(self, phase: Tensor) -> Tensor:
         """Phases [...] with what lies beyond the interval drawn in: e becomes e overrun / (overrun + |e|)."""

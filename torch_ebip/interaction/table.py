@@ -19,9 +19,9 @@ KEPT = 8
 
 
 class DemonstrationTable(nn.Module):
-    """Values and slopes of N demonstrations at P phases, evenly from 0 to 1, and cubic between them.
+    """N demonstrations between P phases, evenly from 0 to 1: a cubic polynomial a cell.
 
-    The interpolation is Hermite's: it has the values and the slopes of the trajectories at the points of the grid.
+    They are Hermite's: with the values and the slopes of the trajectories at both ends of the cell.
 
     Args:
         values: [N, P, D], units of the DoFs.
@@ -39,7 +39,7 @@ class DemonstrationTable(nn.Module):
         [[[0.10890000313520432]]]
     """
 
-    pairs: Tensor
+    cells: Tensor
 
     def __init__(self, values: Tensor, slopes: Tensor) -> None:
         super().__init__()
@@ -50,8 +50,10 @@ class DemonstrationTable(nn.Module):
             )
         self._parts: OrderedDict[tuple[int, ...], tuple[Tensor, int, Tensor]] = OrderedDict()
         step = 1 / (values.shape[1] - 1)
-        # The values, and the slopes of a cell's length, one after the other: a cell is four rows that lie together.
-        self.register_buffer("pairs", owned(torch.stack([values, slopes * step], dim=-2)))
+        first, last = values[:, :-1], values[:, 1:]
+        start, end, rise = slopes[:, :-1] * step, slopes[:, 1:] * step, last - first
+        square = 3 * rise - 2 * start - end
+        self.register_buffer("cells", owned(torch.stack([first, start, square, start + end - 2 * rise], dim=-2)))
 
     @classmethod
     def of(cls, primitive: InteractionPrimitive, points: int = POINTS) -> DemonstrationTable:
@@ -71,7 +73,7 @@ class DemonstrationTable(nn.Module):
     @property
     def n_dofs(self) -> int:
         """D."""
-        return self.pairs.shape[-1]
+        return self.cells.shape[-1]
 
     def at(self, demonstrations: Tensor, phase: Tensor, dofs: Tensor | None = None) -> Tensor:
         """Where demonstrations are at some phases.
@@ -84,29 +86,25 @@ class DemonstrationTable(nn.Module):
         Returns:
             [..., O, k], units of the DoFs; differentiable by phase.
         """
-        N, P = self.pairs.shape[:2]
-        pairs = self.pairs if dofs is None else self._part(dofs)
-        place = phase * (P - 1)
-        cell = place.detach().floor().clamp(0, P - 2)
+        N, P = self.cells.shape[:2]
+        cells = self.cells if dofs is None else self._part(dofs)
+        place = phase * P
+        cell = place.detach().floor().clamp(max=P - 1)
         t = (place - cell).unsqueeze(-1)
-        first = (demonstrations.long().unsqueeze(-1) * P + cell.long()).unsqueeze(-1)
-        rows = 2 * first + torch.arange(4, device=phase.device)
-        corners = pairs.reshape(2 * N * P, -1).index_select(0, rows.reshape(-1)).view(*rows.shape, -1)
-        square, cube = t.square(), t * t.square()
-        shares = torch.cat(
-            [2 * cube - 3 * square + 1, cube - 2 * square + t, 3 * square - 2 * cube, cube - square], -1
-        )
-        return (shares.unsqueeze(-2) @ corners).squeeze(-2)
+        rows = torch.add(cell.long(), demonstrations.unsqueeze(-1), alpha=P)
+        found = cells.reshape(N * P, -1).index_select(0, rows.reshape(-1)).view(*rows.shape, 4, -1)
+        constant, linear, square, cube = found.unbind(-2)
+        return torch.addcmul(constant, t, torch.addcmul(linear, t, torch.addcmul(square, t, cube)))
 
     def _part(self, dofs: Tensor) -> Tensor:
-        """The pairs of some DoFs, int64 [k]; those asked for lately are kept while the table is the same."""
-        if self.pairs.is_inference():
-            return self.pairs[..., dofs]
+        """The cells of some DoFs, int64 [k]; those asked for lately are kept while the table is the same."""
+        if self.cells.is_inference():
+            return self.cells[..., dofs]
         key = tuple(dofs.tolist())
         source, version, part = self._parts.get(key, (None, 0, None))
-        if part is None or source is not self.pairs or version != self.pairs._version:
-            part = self.pairs[..., dofs].contiguous()
-            self._parts[key] = (self.pairs, self.pairs._version, part)
+        if part is None or source is not self.cells or version != self.cells._version:
+            part = self.cells[..., dofs].contiguous()
+            self._parts[key] = (self.cells, self.cells._version, part)
             if len(self._parts) > KEPT:
                 self._parts.popitem(last=False)
         self._parts.move_to_end(key)
@@ -117,13 +115,13 @@ class DemonstrationTable(nn.Module):
         part = DemonstrationTable.__new__(DemonstrationTable)
         nn.Module.__init__(part)
         part._parts = OrderedDict()
-        part.register_buffer("pairs", self.pairs[..., view.dofs])
+        part.register_buffer("cells", self.cells[..., view.dofs])
         return part
 
     def extra_repr(self) -> str:
         """Sizes."""
-        N, P, _, D = self.pairs.shape
-        return f"{N} demonstrations, {P} phases, {D} DoFs"
+        N, P, _, D = self.cells.shape
+        return f"{N} demonstrations, {P + 1} phases, {D} DoFs"
 
     def meant(self) -> str:
         """What its tensors mean, see `Meaning`: nothing beside themselves."""

@@ -97,7 +97,7 @@ class LiveFilter:
             state = filter.initial_state(batch_shape, demonstrations, generator, members=members)
         self.filter, self.generator, self.batch_shape = filter, generator, batch_shape
         self.carrier = SpanCarrier(filter.model, filter.analysis, dofs, state, generator)
-        self._like = self.carrier.matrix
+        self._like, self._dt, self._n_dofs = self.carrier.matrix, filter.dt, filter.n_dofs
         self._forecasters: OrderedDict[tuple[bool, ...], tuple[InteractionEnsembleFilter, Tensor]] = OrderedDict()
 
     @property
@@ -178,7 +178,7 @@ class LiveFilter:
         Raises:
             ValueError: a dt that is negative, NaN or infinite.
         """
-        dt = self.filter.dt if dt is None else dt
+        dt = self._dt if dt is None else dt
         if not (type(dt) is float and 0 <= dt < math.inf):  # most of all calls
             dt = as_number("dt", dt, 0, of="of seconds")
         self.carrier.predict(dt)
@@ -202,7 +202,7 @@ class LiveFilter:
             y = as_values("y", y, self.filter.dof_names, self._like)
         if observed is not None and not isinstance(observed, Tensor):
             observed = torch.as_tensor(observed, device=y.device)
-        return self.take(y, *measured_dofs(y, observed, self._like, self.batch_shape, self.filter.n_dofs))
+        return self.take(y, *measured_dofs(y, observed, self._like, self.batch_shape, self._n_dofs))
 
     @in_own_modes
     @torch.no_grad()

@@ -32,12 +32,14 @@ class Plan:
     Attributes:
         dofs, rows: int64 [K].
         projections: HX, [..., K, E].
-        right, solved: see `Columns`.
+        mean: buffer [..., K] of its mean; ``mean_by_dof`` the same as a column.
+        residual: buffer of y - mean HX, [..., K, 1].
+        solver: the last five fields of `Columns`.
         anomalies: HA, [..., K, E]; ``anomalies_by_member`` the other way round.
         draws: buffer [..., E, K]; ``draws_by_dof`` the other way round.
         constant: of the log-likelihood, -K / 2 log(2 pi).
-        values: buffer [..., K], of what was measured.
-        noise: deviations as a column, [..., K, 1], and R, [..., K, K], while they stay as they are.
+        values: buffer [..., K], of what was measured; ``values_by_dof`` the same as a column, [..., K, 1].
+        noise: deviations [..., K], the same as a column, and R, [..., K, K], while they stay as they are.
     """
 
     def __init__(
@@ -53,16 +55,20 @@ class Plan:
         batch, E = like.shape[:-2], like.shape[-1]
         self.dofs, self.rows = (torch.tensor(numbers, device=like.device) for numbers in (dofs, rows))
         self.values = like.new_empty(*batch, K)
+        self.values_by_dof = self.values.unsqueeze(-1)
         self.projections = like.new_empty(*batch, K, E)
         self.anomalies = torch.empty_like(self.projections)
+        self.mean_by_dof = like.new_empty(*batch, K, 1)
+        self.mean = self.mean_by_dof.squeeze(-1)
         self.anomalies_by_member = self.anomalies.transpose(-1, -2)
         self.draws = like.new_empty(*batch, E, K)
         self.draws_by_dof = self.draws.transpose(-1, -2)
-        self.right, self.solved = (like.new_empty(*batch, E + 1, K).transpose(-1, -2) for _ in range(2))
-        self.residual = self.right[..., E:]
+        right, solved = (like.new_empty(*batch, E + 1, K).transpose(-1, -2) for _ in range(2))
+        self.residual = right[..., E:]
+        self.solver = (right, solved, right[..., :E], solved[..., :E], solved[..., E:])
         self.one = like.new_ones(())
         self.constant = like.new_tensor(-0.5 * K * math.log(2 * math.pi))
-        self.noise: tuple[Tensor, Tensor] | None = None
+        self.noise: tuple[Tensor, Tensor, Tensor] | None = None
         self._project = measurement.projector(members, centre, rows, self.projections, terms)
 
     def project(self) -> Tensor:
@@ -70,11 +76,11 @@ class Plan:
         self._project()
         return self.projections
 
-    def believe(self, deviations: Tensor) -> tuple[Tensor, Tensor]:
-        """Deviations as a column and R, of the deviations [..., D] of all of the sensors' DoFs."""
+    def believe(self, deviations: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Deviations, the same as a column, and R, of the deviations [..., D] of all of the sensors' DoFs."""
         deviation = deviations[..., self.rows]
         R = torch.diag_embed(deviation.square())
-        return deviation.unsqueeze(-1), R.expand(*self.values.shape[:-1], *R.shape[-2:])
+        return deviation, deviation.unsqueeze(-1), R.expand(*self.values.shape[:-1], *R.shape[-2:])
 
     def log_likelihood(self, factor: Tensor, residual: Tensor, shift: Tensor, seen: Tensor | None) -> Tensor:
         """Log-likelihood [...] of a sample.

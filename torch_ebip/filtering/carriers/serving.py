@@ -34,8 +34,8 @@ class ProjectsColumns(Protocol):
 class AdvancesColumns(Protocol):
     """Dynamics that advance what moves in place."""
 
-    def advance_(self, moving: Tensor, dt: float) -> None:
-        """[..., m, E], members as columns, by dt seconds."""
+    def advancer(self, moving: Tensor) -> Callable[[float], None]:
+        """What advances members that are columns, [..., m, E], by so many seconds whenever it is called."""
 
 
 @runtime_checkable
@@ -53,7 +53,7 @@ def why_not_span(model: StateSpace, update: Update) -> str | None:
     if model.moving is None:
         return "the model does not say that a part of its state stands still"
     for part, protocol, what in (
-        (model.dynamics, AdvancesColumns, "dynamics that advance columns (`advance_`)"),
+        (model.dynamics, AdvancesColumns, "dynamics with an `advancer`"),
         (model.process_noise, HasFactor, "a process noise with a `factor`"),
         (model.measurement, ProjectsColumns, "a measurement with a `projector`"),
         (model.measurement, Entries, "a measurement that knows its `entries`"),

@@ -35,7 +35,7 @@ from torch_ebip.filtering.functional.update import Spread
 from torch_ebip.filtering.model import StateSpace
 from torch_ebip.filtering.states import EnsembleState, map_state
 from torch_ebip.filtering.updates.rules import Columns, Rule
-from torch_ebip.filtering.updates.update import Update
+from torch_ebip.filtering.updates.update import Update, analyse
 
 
 class SpanCarrier(Carrier):
@@ -63,8 +63,10 @@ class SpanCarrier(Carrier):
         assert isinstance(part.process_noise, HasFactor)
         assert isinstance(part.measurement, ProjectsColumns)
         assert part.moving is not None
-        self._whole, self._model, self._update, self._generator = model, part, update.select(view), generator
-        self._dynamics, self._process, self._measurement = part.dynamics, part.process_noise, part.measurement
+        self._whole, self._model, self._generator = model, part, generator
+        self._update = update.select(view)
+        self._slots, self._depends_on_state = self._update.slots, part.noise_depends_on_state
+        self._process, self._measurement = part.process_noise, part.measurement
         self._sensors = {dof: row for row, dof in enumerate(view.dofs.tolist())}
         if state.centre is None:  # made by hand
             state = taken_out(model, state)
@@ -76,6 +78,7 @@ class SpanCarrier(Carrier):
         self._columns = ColumnMembers(start, seen, m)
         self._middle = state.centre[..., view.state[m:]]
         self.matrix, self._moving = self._columns.matrix, self._columns.moving
+        self._advance = part.dynamics.advancer(self._moving)
         E = start.shape[-2]
         self._draws = start.new_empty(*start.shape[:-1], m)
         self._draws_by_entry = self._draws.transpose(-1, -2)
@@ -83,7 +86,7 @@ class SpanCarrier(Carrier):
         self._terms = start.new_empty(math.prod(self.batch_shape) * len(seen) * E)
         self._plans: OrderedDict[tuple[bool, ...], Plan | None] = OrderedDict()
         self._noise, self._noise_versions = None, Versions(part.measurement_noise)
-        self._step_factor: tuple[float, Tensor] | None = None
+        self._step_factor: tuple[float, Tensor, Tensor] | None = None
         self._process_versions = Versions(part.process_noise)
         batched = bool(self.batch_shape)
         self._add_product: Callable[..., Tensor] = Tensor.baddbmm_ if batched else Tensor.addmm_
@@ -126,13 +129,14 @@ class SpanCarrier(Carrier):
     def predict(self, dt: float) -> None:
         """x = g(x) + N(0, Q) over dt seconds, finite and not negative."""
         if self._process_versions.changed() or self._step_factor is None or self._step_factor[0] != dt:
-            factor = self._process.factor(self.matrix.new_tensor(dt))
-            self._step_factor = dt, factor.expand(*self.batch_shape, *factor.shape[-2:])
-        self._dynamics.advance_(self._moving, dt)
+            seconds = self.matrix.new_tensor(dt)
+            factor = self._process.factor(seconds)
+            self._step_factor = dt, factor.expand(*self.batch_shape, *factor.shape[-2:]), seconds
+        self._advance(dt)
         self._drawn(self._draws)
         self._add_product(self._moving, self._step_factor[1], self._draws_by_entry)
         if self.memory.weighting is not None:
-            self.memory = self._update.forget(self.memory, self.matrix.new_tensor(dt))
+            self.memory = self._update.forget(self.memory, self._step_factor[2])
 
     def take(self, y: Tensor, measured: tuple[bool, ...], mask: Tensor | None) -> Tensor:
         """Take in one sample that was checked.
@@ -149,7 +153,7 @@ class SpanCarrier(Carrier):
             ValueError: see `LiveFilter.update`.
         """
         plan = kept(self._plans, measured, self._make_plan)
-        perturbs, draws = self._update.rule.perturbs, None
+        perturbs, draws = self._slots.rule.perturbs, None
         if perturbs and is_several(self._generator):
             # What one sequence draws may not depend on what others measure.
             shape = (*self.batch_shape, self.matrix.shape[-1], self._whole.n_dofs)
@@ -161,7 +165,7 @@ class SpanCarrier(Carrier):
         elif perturbs:
             self._drawn(plan.draws)
         sample = self._measure(plan, y, mask)
-        return self._update(self, sample, plan.draws_by_dof if perturbs else None)  # type: ignore[no-any-return]
+        return analyse(self._slots, self, sample, plan.draws_by_dof if perturbs else None)
 
     def variance(self) -> Tensor:
         """See `Carrier.variance`; what is NaN or infinite would pass for far off, so it is refused here."""
@@ -172,21 +176,20 @@ class SpanCarrier(Carrier):
         self, rule: Rule, measured: Measured, taper: Taper | None, spread: Spread, perturbations: Tensor | None
     ) -> Tensor:
         """See `Carrier.move`; perturbations [..., K, E]."""
-        plan, seen, weighted, even = self._plan, self._seen, self._weighted, self._even
-        y, deviation, R = plan.values, self._deviation, self._R
+        plan, seen, weighted, even = self._plan, self._seen, self._weighted, self._shares
+        y, deviation, R = plan.values_by_dof, self._deviation, self._R
         if measured is not self._measured:  # other values and deviations are believed
-            y, believed = measured.y, measured.deviation.unsqueeze(-1)
+            y, believed = measured.y.unsqueeze(-1), measured.deviation.unsqueeze(-1)
             R = R + torch.diag_embed((believed.square() - deviation.square())[..., 0])
             deviation = believed
         S = self._plus_product(R, plan.anomalies, weighted, alpha=self._share)
         factor, info = torch.linalg.cholesky_ex(S)
         if bool(info.any() if self.batch_shape else info):
             self._explain(S, plan)
-        residual = torch.sub(y.unsqueeze(-1), measured.mean.unsqueeze(-1), out=plan.residual)
+        residual = torch.sub(y, plan.mean_by_dof, out=plan.residual)
         if seen is not None:
             residual.masked_fill_(~seen, 0)
-        columns = Columns(plan.anomalies, residual, deviation, factor, plan.right, plan.solved)
-        moves, shift = rule.columns(columns, perturbations)
+        moves, shift = rule.columns(Columns(plan.anomalies, residual, deviation, factor, *plan.solver), perturbations)
         likelihood = plan.log_likelihood(factor, residual, shift, seen)
         if spread.keep is not None:
             moves = torch.lerp(moves @ even, moves, spread.keep[..., None, None])
@@ -205,31 +208,33 @@ class SpanCarrier(Carrier):
     def _measure(self, plan: Plan, y: Tensor, mask: Tensor | None) -> Measured:
         """What is measured and what is expected; the anomalies are left in the plan."""
         torch.index_select(y, -1, plan.dofs, out=plan.values)
-        weighting, even = self.memory.weighting, self._even
+        weighting = self.memory.weighting
+        self._shares = even = self._even
         projections = plan.project()
-        mean = projections @ even
+        mean = torch.matmul(projections, even, out=plan.mean_by_dof)
         anomalies = torch.sub(projections, mean, out=plan.anomalies)
         # Once more: a mean of values far from 0 is rounded, and products need anomalies that sum to 0.
         anomalies.sub_(anomalies @ even)
-        deviation, R = self._believed(plan)
+        deviations, deviation, R = self._believed(plan)
         seen = None
         if mask is not None:
             seen = mask.index_select(-1, plan.dofs).unsqueeze(-1)
             one = torch.eye(R.shape[-1], dtype=R.dtype, device=R.device)
             deviation, R = torch.where(seen, deviation, 0), torch.where(seen, R, one)
+            deviations = deviation.squeeze(-1)
             anomalies.masked_fill_(~seen, 0)
         self._weighted, self._share = plan.anomalies_by_member, 1 / (anomalies.shape[-1] - 1)
         if weighting is not None:
             self._weighted = self._weighted * member_shares(self._weighted, weighting.weights)
             self._share = 1.0
         self._plan, self._seen, self._deviation, self._R = plan, seen, deviation, R
-        observed = None if seen is None else seen[..., 0]
-        self._measured = Measured(plan.values, observed, mean[..., 0], deviation[..., 0], plan.rows)
+        observed = None if seen is None else seen.squeeze(-1)
+        self._measured = Measured(plan.values, observed, plan.mean, deviations, plan.rows)
         return self._measured
 
-    def _believed(self, plan: Plan) -> tuple[Tensor, Tensor]:
+    def _believed(self, plan: Plan) -> tuple[Tensor, Tensor, Tensor]:
         """R of a plan's DoFs, kept while no parameter changes, unless it depends on the state."""
-        if self._model.noise_depends_on_state:
+        if self._depends_on_state:
             return plan.believe(self._model.deviation(self.mean))
         if self._noise_versions.changed():
             for other in self._plans.values():

@@ -27,6 +27,7 @@ class Columns(NamedTuple):
         factor: lower Cholesky factor of S, [..., K, K].
         right, solved: right-hand sides and solutions, [..., K, E + 1], columns contiguous for LAPACK: of the members,
             and in the last column of the mean.
+        right_members, moves, shift: views of them: [..., K, E] of either, and the last column of the solutions.
     """
 
     anomalies: Tensor
@@ -35,6 +36,9 @@ class Columns(NamedTuple):
     factor: Tensor
     right: Tensor
     solved: Tensor
+    right_members: Tensor
+    moves: Tensor
+    shift: Tensor
 
 
 class Rule(Part, ABC):
@@ -81,12 +85,11 @@ class Stochastic(Rule):
     def columns(self, columns: Columns, perturbations: Tensor | None) -> tuple[Tensor, Tensor]:
         """See `Rule.columns`: columns, perturbations [..., K, E] -> moves [..., K, E] and [..., K, 1]."""
         assert perturbations is not None
-        E = columns.anomalies.shape[-1]
         # y + eps - HX, as (y - mean) + eps - HA: what is not measured is 0 in all of them.
-        right = torch.addcmul(columns.residual, columns.deviation, perturbations, out=columns.right[..., :E])
+        right = torch.addcmul(columns.residual, columns.deviation, perturbations, out=columns.right_members)
         right.sub_(columns.anomalies)
-        solved = torch.cholesky_solve(columns.right, columns.factor, out=columns.solved)
-        return solved[..., :E], solved[..., E:]
+        torch.cholesky_solve(columns.right, columns.factor, out=columns.solved)
+        return columns.moves, columns.shift
 
 
 class SquareRoot(Rule):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -21,6 +21,19 @@ from torch_ebip.filtering.updates.weighting import Seen, Weighting
 
 if TYPE_CHECKING:
     from torch_ebip.filtering.carriers.carrier import Carrier, Measured
+
+
+NO_SPREAD = Spread()
+
+
+class Slots(NamedTuple):
+    """The parts of an update, by their places."""
+
+    rule: Rule
+    trust: tuple[RobustWeights, ...]
+    weighting: Weighting | None
+    localisation: Localisation | None
+    inflation: SpreadRule | None
 
 
 class Update(nn.Module):
@@ -101,53 +114,67 @@ class Update(nn.Module):
             setattr(part, name, None if slot is None else slot.select(view))
         return part
 
+    @property
+    def slots(self) -> Slots:
+        """The parts by their places."""
+        return Slots(self.rule, tuple(self.trust), self.weighting, self.localisation, self.inflation)  # type: ignore
+
     def forward(self, carrier: Carrier, measured: Measured, perturbations: Tensor | None) -> Tensor:
-        """x = x + K (y + eps - h(x)), and what is learned beside it.
-
-        Args:
-            carrier: of the members; changed, unless an error is raised.
-            measured: what was measured.
-            perturbations: standard-normal draws [..., E, K], for `Carrier.move`; None if the rule does not perturb.
-
-        Returns:
-            The log-likelihood [...] of what was measured.
-        """
-        memory, observed, trust = carrier.memory, measured.observed, None
-        if len(self.trust):
-            measured, trust = self._trusted(carrier, measured)
-        weighting, inflation, spread = memory.weighting, memory.inflation, Spread()
-        if self.weighting is not None and weighting is not None:
-            origin = memory.origin
-            assert origin is not None
-            seen = Seen(measured.y, observed, trust, measured.rows, carrier.moving, carrier.mean, origin)
-            weighting = self.weighting.learn(weighting, seen)
-        if self.inflation is not None:
-            spread, inflation = self.inflation(inflation, _share(measured, trust))
-        taper = None if self.localisation is None else self.localisation()
-        likelihood = carrier.move(self.rule, measured, taper, spread, perturbations)
-        carrier.memory = Memory(weighting, inflation, memory.origin)
-        return likelihood
-
-    def _trusted(self, carrier: Carrier, measured: Measured) -> tuple[Measured, Tensor]:
-        """Values and deviations that deserve belief, and how much each value counts."""
-        observed, variance = measured.observed, carrier.variance()
-        y, deviation = measured.y, measured.deviation
-        if observed is not None:
-            y = torch.where(observed, y, 0)
-        total: Tensor | None = None
-        for weigh in self.trust:
-            y, deviation, trust = weigh(y, measured.mean, variance, deviation)
-            total = trust if total is None else total * trust
-        assert total is not None
-        if observed is not None:
-            deviation, total = torch.where(observed, deviation, 0), torch.where(observed, total, 0)
-        return measured._replace(y=y, deviation=deviation), total
+        """See `analyse`, which is what a carrier, its measured values and perturbations [..., E, K] are given to."""
+        return analyse(self.slots, carrier, measured, perturbations)
 
 
-def _share(measured: Measured, trust: Tensor | None) -> Tensor:
+def analyse(slots: Slots, carrier: Carrier, measured: Measured, perturbations: Tensor | None) -> Tensor:
+    """x = x + K (y + eps - h(x)), and what is learned beside it: the one place where the parts are put in order.
+
+    Args:
+        slots: the parts.
+        carrier: of the members; changed, unless an error is raised.
+        measured: what was measured.
+        perturbations: standard-normal draws [..., E, K], for `Carrier.move`; None if the rule does not perturb.
+
+    Returns:
+        The log-likelihood [...] of what was measured.
+    """
+    rule, trust, weighting, localisation, inflation = slots
+    memory, counts, spread, taper = carrier.memory, None, NO_SPREAD, None
+    weights, grown = memory.weighting, memory.inflation
+    if trust:
+        measured, counts = _trusted(trust, carrier, measured)
+    if weighting is not None and weights is not None:
+        assert memory.origin is not None
+        seen = Seen(measured.y, measured.observed, counts, measured.rows, carrier.moving, carrier.mean, memory.origin)
+        weights = weighting.learn(weights, seen)
+    if inflation is not None:
+        spread, grown = inflation(grown, _share(measured, counts))
+    if localisation is not None:
+        taper = localisation()
+    likelihood = carrier.move(rule, measured, taper, spread, perturbations)
+    if weights is not memory.weighting or grown is not memory.inflation:
+        carrier.memory = Memory(weights, grown, memory.origin)
+    return likelihood
+
+
+def _trusted(trust: Sequence[RobustWeights], carrier: Carrier, measured: Measured) -> tuple[Measured, Tensor]:
+    """Values and deviations that deserve belief, and how much each value counts."""
+    observed, variance = measured.observed, carrier.variance()
+    y, deviation = measured.y, measured.deviation
+    if observed is not None:
+        y = torch.where(observed, y, 0)
+    total: Tensor | None = None
+    for weigh in trust:
+        y, deviation, counts = weigh(y, measured.mean, variance, deviation)
+        total = counts if total is None else total * counts
+    assert total is not None
+    if observed is not None:
+        deviation, total = torch.where(observed, deviation, 0), torch.where(observed, total, 0)
+    return measured._replace(y=y, deviation=deviation), total
+
+
+def _share(measured: Measured, counts: Tensor | None) -> Tensor:
     """What a sample counts, [...], in [0, 1]."""
-    if trust is not None:
-        return trust.amax(-1)
+    if counts is not None:
+        return counts.amax(-1)
     if measured.observed is None:
         return measured.mean.new_ones(measured.mean.shape[:-1])
     return measured.observed.any(-1).to(measured.mean)
