@@ -10,32 +10,26 @@ from torch_ebip.filtering import (
     EnsembleState,
     ExtendedFilter,
     Filter,
-    Gate,
     GaussianPrior,
     GaussianState,
-    Huber,
-    Inflation,
-    Localisation,
     MeasurementNoise,
     NoProcessNoise,
     ParticleFilter,
     ParticleState,
     Positive,
-    RobustWeights,
-    SquareRoot,
     StateSpace,
-    Stochastic,
-    StudentT,
     Trace,
-    Update,
     View,
     functional,
 )
+from torch_ebip.filtering import (
+    updates as _updates,
+)
+from torch_ebip.filtering.updates import *
 from torch_ebip.interaction import (
     Basis,
     BasisProjection,
     BSplineBasis,
-    ConstantVelocityPhase,
     DemonstrationPrior,
     DemonstrationTable,
     EvidenceWeighting,
@@ -60,6 +54,10 @@ from torch_ebip.interaction import (
     particle_filter,
     select_basis,
 )
+from torch_ebip.interaction import (
+    phases as _phases,
+)
+from torch_ebip.interaction.phases import *
 from torch_ebip.kinematics import RobotArm
 from torch_ebip.learning import (
     ForecastObjective,
@@ -79,7 +77,6 @@ __all__ = [
     "BSplineBasis",
     "Basis",
     "BasisProjection",
-    "ConstantVelocityPhase",
     "DemonstrationPrior",
     "DemonstrationTable",
     "Demonstrations",
@@ -91,12 +88,9 @@ __all__ = [
     "Forecast",
     "ForecastObjective",
     "ForwardKinematicsLoss",
-    "Gate",
     "GaussianBasis",
     "GaussianPrior",
     "GaussianState",
-    "Huber",
-    "Inflation",
     "InnovationLikelihoodLoss",
     "InteractionFilter",
     "InteractionNoise",
@@ -105,7 +99,6 @@ __all__ = [
     "InteractionTrace",
     "Layout",
     "LiveFilter",
-    "Localisation",
     "MeasurementNoise",
     "MixturePrior",
     "Modality",
@@ -119,21 +112,16 @@ __all__ = [
     "PolynomialBasis",
     "Positive",
     "RobotArm",
-    "RobustWeights",
     "SessionForecast",
     "SessionSettings",
     "SigmoidBasis",
-    "SquareRoot",
     "StackedBasis",
     "StateSpace",
-    "Stochastic",
-    "StudentT",
     "Trace",
     "TrajectoryLoss",
     "Tuner",
     "TuningResult",
     "TuningSettings",
-    "Update",
     "View",
     "WeightNoise",
     "bip",
@@ -145,6 +133,8 @@ __all__ = [
     "replay",
     "select_basis",
 ]
+__all__ += _updates.__all__
+__all__ += _phases.__all__
 
 
 def __getattr__(name: str) -> str:

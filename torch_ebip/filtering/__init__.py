@@ -1,6 +1,6 @@
 """A general filter layer: any dynamics g, any measurement h; it knows nothing of interactions."""
 
-from torch_ebip.filtering import functional
+from torch_ebip.filtering import functional, updates
 from torch_ebip.filtering.base import Filter
 from torch_ebip.filtering.ensemble import EnsembleFilter
 from torch_ebip.filtering.extended import ExtendedFilter, GaussianState
@@ -10,21 +10,7 @@ from torch_ebip.filtering.particle import ParticleFilter, ParticleState
 from torch_ebip.filtering.priors import GaussianPrior
 from torch_ebip.filtering.states import EnsembleState, Memory
 from torch_ebip.filtering.trace import Trace
-from torch_ebip.filtering.updates import (
-    Gate,
-    Huber,
-    Inflation,
-    Localisation,
-    Part,
-    RobustWeights,
-    Rule,
-    SpreadRule,
-    SquareRoot,
-    Stochastic,
-    StudentT,
-    Update,
-    Weighting,
-)
+from torch_ebip.filtering.updates import *
 
 __all__ = [
     "AboveOne",
@@ -33,29 +19,17 @@ __all__ = [
     "EnsembleState",
     "ExtendedFilter",
     "Filter",
-    "Gate",
     "GaussianPrior",
     "GaussianState",
-    "Huber",
-    "Inflation",
-    "Localisation",
     "MeasurementNoise",
     "Memory",
     "NoProcessNoise",
-    "Part",
     "ParticleFilter",
     "ParticleState",
     "Positive",
-    "RobustWeights",
-    "Rule",
-    "SpreadRule",
-    "SquareRoot",
     "StateSpace",
-    "Stochastic",
-    "StudentT",
     "Trace",
-    "Update",
     "View",
-    "Weighting",
     "functional",
 ]
+__all__ += updates.__all__

@@ -1,5 +1,6 @@
 """Interactions: phase, bases, primitives, and the filters of the paper over them."""
 
+from torch_ebip.interaction import phases
 from torch_ebip.interaction.basis import (
     Basis,
     BSplineBasis,
@@ -13,7 +14,6 @@ from torch_ebip.interaction.basis import (
     select_basis,
     selection_table,
 )
-from torch_ebip.interaction.constant_velocity import ConstantVelocityPhase
 from torch_ebip.interaction.evidence import Evidence, EvidenceWeighting
 from torch_ebip.interaction.filters import (
     InteractionEnsembleFilter,
@@ -26,7 +26,7 @@ from torch_ebip.interaction.gated_noise import PhaseGatedNoise
 from torch_ebip.interaction.mixture import MixturePrior
 from torch_ebip.interaction.model import demonstration_states, interaction_model
 from torch_ebip.interaction.noise import InteractionNoise, PhaseNoise, WeightNoise
-from torch_ebip.interaction.phase import PhaseModel
+from torch_ebip.interaction.phases import *
 from torch_ebip.interaction.presets import bip, ebip, ebip_minus, particle_filter
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.interaction.priors import DemonstrationPrior, MomentPrior
@@ -39,7 +39,6 @@ __all__ = [
     "Basis",
     "BasisProjection",
     "CandidateFit",
-    "ConstantVelocityPhase",
     "DemonstrationPrior",
     "DemonstrationTable",
     "Evidence",
@@ -56,7 +55,6 @@ __all__ = [
     "MixturePrior",
     "MomentPrior",
     "PhaseGatedNoise",
-    "PhaseModel",
     "PhaseNoise",
     "PolynomialBasis",
     "SigmoidBasis",
@@ -73,3 +71,4 @@ __all__ = [
     "select_basis",
     "selection_table",
 ]
+__all__ += phases.__all__

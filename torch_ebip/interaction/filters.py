@@ -22,7 +22,7 @@ from torch_ebip.filtering.particle import ParticleFilter
 from torch_ebip.filtering.states import State
 from torch_ebip.interaction.attribution import affine_coefficients
 from torch_ebip.interaction.forecast import Forecast
-from torch_ebip.interaction.phase import PhaseModel
+from torch_ebip.interaction.phases.phase import PhaseModel
 from torch_ebip.interaction.projection import BasisProjection
 from torch_ebip.interaction.trace import InteractionTrace
 

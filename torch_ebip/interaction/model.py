@@ -12,10 +12,10 @@ from torch_ebip.common.arguments import as_number, as_values
 from torch_ebip.filtering.model import StateSpace
 from torch_ebip.filtering.noise.measurement import MeasurementNoise
 from torch_ebip.interaction.basis.base import Basis
-from torch_ebip.interaction.constant_velocity import ConstantVelocityPhase
 from torch_ebip.interaction.gated_noise import PhaseGatedNoise
 from torch_ebip.interaction.noise import InteractionNoise, WeightNoise
-from torch_ebip.interaction.phase import PhaseModel
+from torch_ebip.interaction.phases.constant_velocity import ConstantVelocityPhase
+from torch_ebip.interaction.phases.phase import PhaseModel
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.interaction.projection import BasisProjection
 

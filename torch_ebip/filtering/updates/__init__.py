@@ -1,28 +1,18 @@
-"""What happens at a measurement, one idea a file."""
+"""What happens at a measurement, one idea a file. A line here exports a part to `torch_ebip` itself."""
 
-from torch_ebip.filtering.updates.gate import Gate
-from torch_ebip.filtering.updates.huber import Huber
-from torch_ebip.filtering.updates.inflation import Inflation, SpreadRule
-from torch_ebip.filtering.updates.localisation import Localisation
-from torch_ebip.filtering.updates.part import Part
-from torch_ebip.filtering.updates.rules import Rule, SquareRoot, Stochastic
-from torch_ebip.filtering.updates.student_t import StudentT
-from torch_ebip.filtering.updates.trust import RobustWeights
-from torch_ebip.filtering.updates.update import Update
-from torch_ebip.filtering.updates.weighting import Weighting
+from torch_ebip.common.exports import exported
+from torch_ebip.filtering.updates.gate import Gate as Gate
+from torch_ebip.filtering.updates.huber import Huber as Huber
+from torch_ebip.filtering.updates.inflation import Inflation as Inflation
+from torch_ebip.filtering.updates.inflation import SpreadRule as SpreadRule
+from torch_ebip.filtering.updates.localisation import Localisation as Localisation
+from torch_ebip.filtering.updates.part import Part as Part
+from torch_ebip.filtering.updates.rules import Rule as Rule
+from torch_ebip.filtering.updates.rules import SquareRoot as SquareRoot
+from torch_ebip.filtering.updates.rules import Stochastic as Stochastic
+from torch_ebip.filtering.updates.student_t import StudentT as StudentT
+from torch_ebip.filtering.updates.trust import RobustWeights as RobustWeights
+from torch_ebip.filtering.updates.update import Update as Update
+from torch_ebip.filtering.updates.weighting import Weighting as Weighting
 
-__all__ = [
-    "Gate",
-    "Huber",
-    "Inflation",
-    "Localisation",
-    "Part",
-    "RobustWeights",
-    "Rule",
-    "SpreadRule",
-    "SquareRoot",
-    "Stochastic",
-    "StudentT",
-    "Update",
-    "Weighting",
-]
+__all__ = exported(globals())

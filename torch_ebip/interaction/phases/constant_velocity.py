@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torch_ebip.interaction.noise import PhaseNoise
-from torch_ebip.interaction.phase import PhaseModel
+from torch_ebip.interaction.phases.phase import PhaseModel
 from torch_ebip.interaction.primitive import InteractionPrimitive
 
 

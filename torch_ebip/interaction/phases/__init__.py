@@ -1,0 +1,7 @@
+"""How the phase moves, one idea a file. A line here exports a phase model to `torch_ebip` itself."""
+
+from torch_ebip.common.exports import exported
+from torch_ebip.interaction.phases.constant_velocity import ConstantVelocityPhase as ConstantVelocityPhase
+from torch_ebip.interaction.phases.phase import PhaseModel as PhaseModel
+
+__all__ = exported(globals())
