@@ -1,6 +1,7 @@
 """What happens at a measurement, one idea a file. A line here exports a part to `torch_ebip` itself."""
 
 from torch_ebip.common.exports import exported
+from torch_ebip.filtering.updates.cauchy import Cauchy as Cauchy
 from torch_ebip.filtering.updates.gate import Gate as Gate
 from torch_ebip.filtering.updates.huber import Huber as Huber
 from torch_ebip.filtering.updates.inflation import Inflation as Inflation
