@@ -4,6 +4,7 @@ Ensemble Bayesian Interaction Primitives (Campbell, Stepputtis & Ben Amor, RSS 2
 layer for any dynamics and any measurement.
 """
 
+from torch_ebip.common.exports import exported as _exported
 from torch_ebip.filtering import (
     AboveOne,
     EnsembleFilter,
@@ -133,8 +134,8 @@ __all__ = [
     "replay",
     "select_basis",
 ]
-__all__ += _updates.__all__
-__all__ += _phases.__all__
+__all__ += _exported(vars(_updates))
+__all__ += _exported(vars(_phases))
 
 
 def __getattr__(name: str) -> str:

@@ -1,5 +1,6 @@
 """A general filter layer: any dynamics g, any measurement h; it knows nothing of interactions."""
 
+from torch_ebip.common.exports import exported
 from torch_ebip.filtering import functional, updates
 from torch_ebip.filtering.base import Filter
 from torch_ebip.filtering.ensemble import EnsembleFilter
@@ -32,4 +33,4 @@ __all__ = [
     "View",
     "functional",
 ]
-__all__ += updates.__all__
+__all__ += exported(vars(updates))

@@ -1,5 +1,6 @@
 """Interactions: phase, bases, primitives, and the filters of the paper over them."""
 
+from torch_ebip.common.exports import exported
 from torch_ebip.interaction import phases
 from torch_ebip.interaction.basis import (
     Basis,
@@ -71,4 +72,4 @@ __all__ = [
     "select_basis",
     "selection_table",
 ]
-__all__ += phases.__all__
+__all__ += exported(vars(phases))

@@ -1,5 +1,7 @@
 """What happens at a measurement, one idea a file. A line here exports a part to `torch_ebip` itself."""
 
+from typing import TYPE_CHECKING
+
 from torch_ebip.common.exports import exported
 from torch_ebip.filtering.updates.cauchy import Cauchy as Cauchy
 from torch_ebip.filtering.updates.gate import Gate as Gate
@@ -16,4 +18,5 @@ from torch_ebip.filtering.updates.trust import RobustWeights as RobustWeights
 from torch_ebip.filtering.updates.update import Update as Update
 from torch_ebip.filtering.updates.weighting import Weighting as Weighting
 
-__all__ = exported(globals())
+if not TYPE_CHECKING:  # a type checker reads the lines above
+    __all__ = exported(globals())
