@@ -34,9 +34,15 @@ class PhaseNoise(nn.Module):
         self.coupling = Positive(torch.ones_like(acceleration))
         self.independent = Positive(torch.full_like(acceleration, 0.01))
 
-    def cholesky(self, dt: Tensor) -> Tensor:
-        """Lower factor of Q for steps dt [...] in seconds: [..., 2, 2]; Q in (1, 1/s) units."""
-        sigma = self.acceleration.value
+    def cholesky(self, dt: Tensor, steps: int = 1) -> Tensor:
+        """Lower factor of Q for steps dt [...] in seconds: [..., 2, 2]; Q in (1, 1/s) units.
+
+        Args:
+            dt: [...], seconds.
+            steps: for how many samples each one stands: an acceleration that lasts k of them as one would move the
+                velocity k times as far (in variance) as k accelerations; this takes that back.
+        """
+        sigma = self.acceleration.value / math.sqrt(steps)
         phase = 0.5 * dt.square() * sigma
         zero = torch.zeros_like(phase)
         lower = [dt * sigma * self.coupling.value, dt * sigma * self.independent.value]
@@ -86,11 +92,8 @@ class WeightNoise(nn.Module):
 class InteractionNoise(FastTwins, nn.Module):
     """Process noise of a state of what moves and of weights.
 
-    White accelerations that last k steps of dt as one would move the velocity k times as far (in variance) as k
-    of them; the stride takes that back, so that a step that stands for k has the noise of k steps.
-
     Args:
-        phase: noise of what moves, with ``cholesky(dt [...])`` -> [..., m, m], such as `PhaseNoise`.
+        phase: noise of what moves, with ``cholesky(dt [...], steps)`` -> [..., m, m], such as `PhaseNoise`.
         weights: noise of the others; default none, so that members stay in the span of the demonstrations.
         moving: m.
     """
@@ -126,8 +129,7 @@ class InteractionNoise(FastTwins, nn.Module):
 
     def factor(self, dt: Tensor) -> Tensor:
         """Lower factor [..., m, m] of the covariance of what moves for steps dt [...] seconds."""
-        cholesky: Tensor = self.phase.cholesky(dt)  # type: ignore[operator]
-        return cholesky / math.sqrt(self.stride)
+        return self.phase.cholesky(dt, self.stride)  # type: ignore[operator, no-any-return]
 
     def covariance(self, dt: Tensor) -> tuple[Tensor, Tensor | None]:
         """Q for steps dt [...] seconds, which has two blocks.

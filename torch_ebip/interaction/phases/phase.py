@@ -55,7 +55,7 @@ class PhaseModel(FastTwins, nn.Module, ABC):
 
     @abstractmethod
     def noise(self, primitive: InteractionPrimitive) -> nn.Module:
-        """Q of what moves, with parameters of its own: a module with ``cholesky(dt [...])`` -> [..., m, m]."""
+        """Q of what moves, with parameters of its own: a module with ``cholesky(dt [...], steps)`` -> [..., m, m]."""
 
     def forward(self, members: Tensor, dt: Tensor) -> Tensor:
         """The members [..., E, n] after dt [...] seconds: the phase advances by its velocity times dt."""
