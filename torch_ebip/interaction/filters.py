@@ -99,7 +99,7 @@ class InteractionFilter(Filter):
 
     def phase_velocity(self, state: State) -> Tensor:
         """[...], mean phase velocity of a state, 1/s."""
-        return self.phase_model.rate(self.moving(state))
+        return self.phase_model.velocity(self.moving(state))
 
     @abstractmethod
     def forecast(self, state: State, phase: Phases | None = None) -> Forecast:

@@ -121,7 +121,7 @@ class LiveFilter:
     @in_own_modes
     def phase_velocity(self) -> Tensor:
         """Mean phase velocity [...], 1/s."""
-        return self.filter.phase_model.rate(self.carrier.mean)
+        return self.filter.phase_model.velocity(self.carrier.mean)
 
     @property
     def finite(self) -> bool:

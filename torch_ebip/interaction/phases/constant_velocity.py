@@ -28,7 +28,7 @@ class ConstantVelocityPhase(PhaseModel):
         """Phase and phase velocity."""
         return 2
 
-    def rate(self, moving: Tensor) -> Tensor:
+    def velocity(self, moving: Tensor) -> Tensor:
         """Phase velocity [...], 1/s, of what moves [..., 2]."""
         return moving.select(-1, 1)
 

@@ -46,7 +46,7 @@ class PhaseModel(FastTwins, nn.Module, ABC):
         """m, how many leading entries of a state it moves."""
 
     @abstractmethod
-    def rate(self, moving: Tensor) -> Tensor:
+    def velocity(self, moving: Tensor) -> Tensor:
         """Phase velocity [...], 1/s, of what moves [..., m]."""
 
     @abstractmethod
@@ -61,7 +61,7 @@ class PhaseModel(FastTwins, nn.Module, ABC):
         """The members [..., E, n] after dt [...] seconds: the phase advances by its velocity times dt."""
         # A copy with one column exchanged costs a third of putting columns together.
         moved = members.clone()
-        moved[..., 0] = self.hold(members[..., 0] + self.rate(members[..., : self.moving]) * dt[..., None])
+        moved[..., 0] = self.hold(members[..., 0] + self.velocity(members[..., : self.moving]) * dt[..., None])
         return moved
 
     def advancer(self, moving: Tensor) -> Callable[[float], None]:
@@ -74,12 +74,12 @@ class PhaseModel(FastTwins, nn.Module, ABC):
             A function of dt in seconds.
         """
         phase, by_member = moving.select(-2, 0), moving.transpose(-1, -2)
-        rate = self.rate(by_member)
-        follows = rate._is_view() and rate._base is by_member._base  # what is a view changes with what it is of
+        velocity = self.velocity(by_member)
+        follows = velocity._is_view() and velocity._base is by_member._base  # a view changes with its base
 
         def advance(dt: float) -> None:
             """Advance by dt seconds."""
-            phase.add_(rate if follows else self.rate(by_member), alpha=dt)
+            phase.add_(velocity if follows else self.velocity(by_member), alpha=dt)
             low, high = torch.aminmax(phase)
             if float(low) < 0 or float(high) > 1:
                 phase.copy_(self.hold(phase))
@@ -94,7 +94,7 @@ class PhaseModel(FastTwins, nn.Module, ABC):
 
     def slope(self, mean: Tensor, dt: Tensor) -> Tensor:
         """Derivative [...] of the phase in dt [...] seconds by that of the mean [..., n]: 1 within the interval."""
-        phase = mean[..., 0] + self.rate(mean[..., : self.moving]) * dt
+        phase = mean[..., 0] + self.velocity(mean[..., : self.moving]) * dt
         excess = (phase - phase.clamp(0, 1)).abs()
         return (1 + excess / self.overrun).pow(-2)
 
