@@ -15,7 +15,8 @@ from torch_ebip.common.draws import Generators
 from torch_ebip.common.meaning import Meaning
 from torch_ebip.common.modules import sharing
 from torch_ebip.filtering.checks import as_sample, check_sequence, usable
-from torch_ebip.filtering.model import Narrows, StateSpace, View
+from torch_ebip.filtering.model import StateSpace
+from torch_ebip.filtering.protocols import Narrows, View
 from torch_ebip.filtering.sequence import filter_step_by_step
 from torch_ebip.filtering.states import State
 from torch_ebip.filtering.trace import Trace

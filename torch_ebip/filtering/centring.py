@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from torch_ebip.filtering.model import Moves, StateSpace
+from torch_ebip.filtering.model import StateSpace
+from torch_ebip.filtering.protocols import Moves
 from torch_ebip.filtering.states import EnsembleState
 
 

@@ -12,10 +12,11 @@ from torch_ebip.filtering.carriers.serving import why_not_span
 from torch_ebip.filtering.centring import taken_out
 from torch_ebip.filtering.in_place import filter_in_place
 from torch_ebip.filtering.members import MemberFilter, NumbersItsStates
-from torch_ebip.filtering.model import StateSpace, View
+from torch_ebip.filtering.model import StateSpace
+from torch_ebip.filtering.protocols import View
 from torch_ebip.filtering.states import EnsembleState
 from torch_ebip.filtering.trace import Trace
-from torch_ebip.filtering.updates.update import Update
+from torch_ebip.filtering.updates.update import Update, analyse
 
 
 class EnsembleFilter(MemberFilter):
@@ -80,7 +81,7 @@ class EnsembleFilter(MemberFilter):
         elif draws is None and perturbs:
             draws = standard_normal(carrier.projections.shape, state.deviations, generator)
         try:
-            likelihood = self.analysis(carrier, carrier.measured, draws)
+            likelihood = analyse(self.analysis.slots, carrier, carrier.measured, draws)
         except functional.FactorisationError as error:
             raise self.model.named(error, carrier.rows) from error
         return carrier.state, likelihood

@@ -17,7 +17,8 @@ from torch_ebip.common.ambient import eager
 from torch_ebip.common.draws import Generators
 from torch_ebip.filtering.base import Filter
 from torch_ebip.filtering.functional import FactorisationError, add_product, cholesky
-from torch_ebip.filtering.model import StateSpace, View
+from torch_ebip.filtering.model import StateSpace
+from torch_ebip.filtering.protocols import View
 from torch_ebip.filtering.updates.trust import RobustWeights
 
 

@@ -1,13 +1,12 @@
 """A state-space model: dynamics g, measurement h and their noise; whole, or narrowed to some of its DoFs.
 
-Any modules will do. What they may say beyond computing their values is in the protocols below: a filter asks for a
-protocol, never for a class, so that a model of somebody else's gets all that it says it can do.
+Any modules will do. What they may say beyond computing their values is in `protocols`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -18,81 +17,19 @@ from torch_ebip.common.modules import sharing
 from torch_ebip.filtering import functional
 from torch_ebip.filtering.noise.measurement import SaysWhatItDependsOn, SelectedNoise
 from torch_ebip.filtering.noise.process import NoProcessNoise
+from torch_ebip.filtering.protocols import (
+    AddsInPlace,
+    Entries,
+    MakesNewMembers,
+    MayLeaveSpan,
+    Moves,
+    Narrows,
+    Rows,
+    View,
+)
 
-
-class View(NamedTuple):
-    """Some of a model.
-
-    Attributes:
-        dofs: int64 [k], which DoFs, ascending.
-        state: int64 [m], which entries of the state, ascending; what moves is always among them.
-        stride: how many samples each one stands for, on top of what it did.
-    """
-
-    dofs: Tensor
-    state: Tensor
-    stride: int = 1
-
-
-@runtime_checkable
-class Moves(Protocol):
-    """Dynamics or an additive process noise that say which part of a state they touch."""
-
-    @property
-    def moving(self) -> int | None:
-        """How many leading entries; None for all."""
-
-
-@runtime_checkable
-class MayLeaveSpan(Protocol):
-    """A part that may move what stands still out of the span of the first ensemble."""
-
-    @property
-    def leaves_span(self) -> str | None:
-        """Why it does; None if it does not."""
-
-
-@runtime_checkable
-class Narrows(Protocol):
-    """A part that can be narrowed to some of the DoFs and of the state, with its parameters, not copies of them."""
-
-    def select(self, view: View) -> Any:
-        """The same for a view of the model."""
-
-
-@runtime_checkable
-class Rows(Protocol):
-    """A measurement that can be asked for some DoFs, of what moves and what stands still of a state, apart."""
-
-    def rows(self, moving: Tensor, still: Tensor, dofs: Sequence[int] | None, centre: Tensor | None = None) -> Tensor:
-        """h [..., E, k] for ascending dofs, None for all.
-
-        Of entries that move [..., E, m] and others [..., E, n - m], the latter as deviations from a centre [..., n
-        - m].
-        """
-
-
-@runtime_checkable
-class AddsInPlace(Protocol):
-    """A process noise that can be added to members that nobody else holds: one copy less."""
-
-    def add_(self, members: Tensor, dt: Tensor, generator: Any = None) -> Tensor:
-        """Members [..., E, n] with noise added, in place."""
-
-
-@runtime_checkable
-class MakesNewMembers(Protocol):
-    """Dynamics whose result is never their argument, nor a view of it."""
-
-    makes_new_members: bool
-
-
-@runtime_checkable
-class Entries(Protocol):
-    """A measurement that knows on which entries of the state a DoF depends, beside those that move."""
-
-    def entries(self, dofs: Tensor) -> Tensor:
-        """int64 [m], ascending, for some DoFs, bool [D]."""
+PARTS = ("dynamics", "measurement", "process_noise", "measurement_noise")
+"""Of a `StateSpace`: about these it asks when they are put in."""
 
 
 class StateSpace(nn.Module):
@@ -156,7 +93,7 @@ class StateSpace(nn.Module):
 
     def __setattr__(self, name: str, value: Any) -> None:
         super().__setattr__(name, value)
-        if name in ("dynamics", "process_noise", "measurement_noise") and "measurement_noise" in self._modules:
+        if name in PARTS and "measurement_noise" in self._modules:
             self._ask_parts()
 
     def _ask_parts(self) -> None:
@@ -166,6 +103,8 @@ class StateSpace(nn.Module):
         stirred = noise.moving if isinstance(noise, Moves) else None
         self.moving = None if self.leading is None or stirred is None else max(self.leading, stirred)
         self.noise_depends_on_state = measured.depends_on_state if isinstance(measured, SaysWhatItDependsOn) else True
+        measurement = self.measurement
+        self._rows = measurement.rows if isinstance(measurement, Rows) else None
         new = isinstance(dynamics, MakesNewMembers) and dynamics.makes_new_members
         self._adds_in_place = new and isinstance(noise, AddsInPlace)
 
@@ -183,21 +122,28 @@ class StateSpace(nn.Module):
         """Mean [..., m] of entries of members [..., E, m], their ``member_weights`` [..., E]; see `difference`."""
         return functional.ensemble_mean(members, member_weights)
 
-    def project(self, members: Tensor, rows: Tensor | None = None, centre: Tensor | None = None) -> Tensor:
+    def project(
+        self,
+        members: Tensor,
+        rows: Tensor | None = None,
+        centre: Tensor | None = None,
+        parts: tuple[Tensor, Tensor] | None = None,
+    ) -> Tensor:
         """h [..., E, k] of members [..., E, n], for some DoFs int64 [k], ascending; None for all.
 
         Args:
             members: [..., E, n], as they are, or as deviations from a centre.
             rows: int64 [k].
             centre: [..., n].
+            parts: what `split` makes of the members, [..., E, m] and [..., E, n - m], where that is known.
 
         Raises:
             ValueError: a measurement that gives another number of values than there are DoFs.
         """
-        if self.leading is not None and isinstance(self.measurement, Rows):
-            moving, still = self.split(members)
+        if self._rows is not None and self.leading is not None:
+            moving, still = self.split(members) if parts is None else parts
             centre = None if centre is None or not bool(centre.any()) else centre[..., self.leading :]
-            return self.measurement.rows(moving, still, None if rows is None else rows.tolist(), centre)
+            return self._rows(moving, still, None if rows is None else rows.tolist(), centre)
         values: Tensor = self.measurement(members if centre is None else members + centre.unsqueeze(-2))
         if values.shape != (*members.shape[:-1], self.n_dofs):
             raise ValueError(

@@ -13,7 +13,8 @@ from torch_ebip.common.arguments import as_number
 from torch_ebip.common.draws import Generators, uniform
 from torch_ebip.filtering import functional
 from torch_ebip.filtering.members import MemberFilter
-from torch_ebip.filtering.model import StateSpace, View
+from torch_ebip.filtering.model import StateSpace
+from torch_ebip.filtering.protocols import View
 from torch_ebip.filtering.updates.trust import RobustWeights
 
 

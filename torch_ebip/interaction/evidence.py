@@ -21,8 +21,9 @@ from torch import Tensor
 from torch_ebip.common.ambient import owned
 from torch_ebip.common.arguments import as_number
 from torch_ebip.common.modules import Versions, sharing
-from torch_ebip.filtering.model import StateSpace, View
+from torch_ebip.filtering.model import StateSpace
 from torch_ebip.filtering.noise.constraints import Positive
+from torch_ebip.filtering.protocols import View
 from torch_ebip.filtering.updates.weighting import Seen, Weighting
 from torch_ebip.interaction.table import KEPT, DemonstrationTable
 from torch_ebip.recordings.layout import Layout

@@ -17,8 +17,8 @@ from torch_ebip.filtering.base import EngineName, Filter
 from torch_ebip.filtering.ensemble import EnsembleFilter
 from torch_ebip.filtering.extended import ExtendedFilter, GaussianState
 from torch_ebip.filtering.members import MemberFilter
-from torch_ebip.filtering.model import MayLeaveSpan
 from torch_ebip.filtering.particle import ParticleFilter
+from torch_ebip.filtering.protocols import MayLeaveSpan
 from torch_ebip.filtering.states import State
 from torch_ebip.interaction.attribution import affine_coefficients
 from torch_ebip.interaction.forecast import Forecast

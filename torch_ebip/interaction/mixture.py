@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch_ebip.common.ambient import owned
 from torch_ebip.common.arguments import as_count
 from torch_ebip.common.draws import Generators, standard_normal, uniform
-from torch_ebip.filtering.model import View
+from torch_ebip.filtering.protocols import View
 from torch_ebip.interaction.priors import check_members, check_states
 
 

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from torch_ebip.common.ambient import owned
 from torch_ebip.common.draws import Generators, standard_normal
 from torch_ebip.common.modules import FastTwins, sharing
-from torch_ebip.filtering.model import View
 from torch_ebip.filtering.noise.constraints import Positive
+from torch_ebip.filtering.protocols import View
 from torch_ebip.recordings.layout import Layout
 
 

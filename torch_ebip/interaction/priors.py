@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch_ebip.common.ambient import owned
 from torch_ebip.common.arguments import as_number
 from torch_ebip.common.draws import Generators, integers
-from torch_ebip.filtering.model import View
+from torch_ebip.filtering.protocols import View
 
 
 class DemonstrationPrior(nn.Module):

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from torch_ebip.common.modules import FastTwins
 from torch_ebip.filtering.carriers.columns import ColumnMembers
-from torch_ebip.filtering.model import View
+from torch_ebip.filtering.protocols import View
 from torch_ebip.interaction.basis.stacked import StackedBasis
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_ebip.common.ambient import owned
-from torch_ebip.filtering.model import View
+from torch_ebip.filtering.protocols import View
 from torch_ebip.interaction.primitive import InteractionPrimitive
 
 POINTS = 41

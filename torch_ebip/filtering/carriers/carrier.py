@@ -13,19 +13,17 @@ from torch_ebip.filtering.updates.rules import Rule
 
 
 class Measured(NamedTuple):
-    """What was measured, and what was expected, over K DoFs.
+    """What was measured, and with which noise, over K DoFs.
 
     Attributes:
         y: [..., K], units of the DoFs; anything where not observed.
         observed: bool [..., K]; None for all.
-        mean: [..., K], of h(x).
         deviation: [K] or [..., K], square root of R.
         rows: int64 [K], which of the model's DoFs; None for all.
     """
 
     y: Tensor
     observed: Tensor | None
-    mean: Tensor
     deviation: Tensor
     rows: Tensor | None
 
@@ -44,6 +42,10 @@ class Carrier(ABC):
     @abstractmethod
     def mean(self) -> Tensor:
         """[..., m], its mean."""
+
+    @abstractmethod
+    def expected(self) -> Tensor:
+        """[..., K], mean of h(x) over members, of the DoFs that are being measured."""
 
     @abstractmethod
     def variance(self) -> Tensor:

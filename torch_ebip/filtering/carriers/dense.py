@@ -31,15 +31,15 @@ class DenseCarrier(Carrier):
     def __init__(self, model: StateSpace, state: EnsembleState, y: Tensor, observed: Tensor) -> None:
         self._model, self._state, self._weights = model, state, state.weights
         self._members, self.memory = state.deviations, state.memory
-        self._moving = model.split(state.deviations)[0]
+        parts = model.split(state.deviations)
+        self._moving = parts[0]
         measured = observed.reshape(-1, model.n_dofs).any(0)
         self.rows = rows = None if bool(measured.all()) else measured.nonzero().squeeze(-1)
-        self.projections = model.project(state.deviations, rows, state.centre)
+        self.projections = model.project(state.deviations, rows, state.centre, parts)
         deviation = model.deviation(self.mean if model.noise_depends_on_state else None)
         if rows is not None:
             y, observed, deviation = y[..., rows], observed[..., rows], deviation[..., rows]
-        mean = functional.ensemble_mean(self.projections, self._weights)
-        self.measured = Measured(y, observed, mean, deviation, rows)
+        self.measured = Measured(y, observed, deviation, rows)
 
     @property
     def state(self) -> EnsembleState:
@@ -55,6 +55,10 @@ class DenseCarrier(Carrier):
     def mean(self) -> Tensor:
         """See `Carrier.mean`."""
         return self._model.mean(self._moving, self._weights)
+
+    def expected(self) -> Tensor:
+        """See `Carrier.expected`."""
+        return functional.ensemble_mean(self.projections, self._weights)
 
     def variance(self) -> Tensor:
         """See `Carrier.variance`."""

@@ -8,7 +8,8 @@ from typing import Protocol, runtime_checkable
 from torch import Tensor
 
 from torch_ebip.filtering.carriers.columns import ColumnMembers
-from torch_ebip.filtering.model import Entries, StateSpace
+from torch_ebip.filtering.model import StateSpace
+from torch_ebip.filtering.protocols import Entries
 from torch_ebip.filtering.updates.update import Update
 
 

@@ -91,6 +91,7 @@ class SpanCarrier(Carrier):
         batched = bool(self.batch_shape)
         self._add_product: Callable[..., Tensor] = Tensor.baddbmm_ if batched else Tensor.addmm_
         self._plus_product: Callable[..., Tensor] = torch.baddbmm if batched else torch.addmm
+        self._product: Callable[..., Tensor] = torch.bmm if batched else torch.mm
 
     @property
     def moving(self) -> Tensor:
@@ -167,6 +168,10 @@ class SpanCarrier(Carrier):
         sample = self._measure(plan, y, mask)
         return analyse(self._slots, self, sample, plan.draws_by_dof if perturbs else None)
 
+    def expected(self) -> Tensor:
+        """See `Carrier.expected`."""
+        return self._plan.mean
+
     def variance(self) -> Tensor:
         """See `Carrier.variance`; what is NaN or infinite would pass for far off, so it is refused here."""
         self._plan.check_finite(self._seen)
@@ -193,7 +198,7 @@ class SpanCarrier(Carrier):
         likelihood = plan.log_likelihood(factor, residual, shift, seen)
         if spread.keep is not None:
             moves = torch.lerp(moves @ even, moves, spread.keep[..., None, None])
-        self._add_product(self.matrix, self.matrix @ weighted, moves, alpha=self._share)
+        self._add_product(self.matrix, self._product(self.matrix, weighted), moves, alpha=self._share)
         if spread.scale is not None:
             scale = spread.scale if seen is None else torch.where(seen.any(-2)[..., 0], spread.scale, 1)
             self.matrix.lerp_(self.matrix @ even, (1 - scale)[..., None, None])
@@ -211,10 +216,10 @@ class SpanCarrier(Carrier):
         weighting = self.memory.weighting
         self._shares = even = self._even
         projections = plan.project()
-        mean = torch.matmul(projections, even, out=plan.mean_by_dof)
+        mean = self._product(projections, even, out=plan.mean_by_dof)
         anomalies = torch.sub(projections, mean, out=plan.anomalies)
         # Once more: a mean of values far from 0 is rounded, and products need anomalies that sum to 0.
-        anomalies.sub_(anomalies @ even)
+        anomalies.sub_(self._product(anomalies, even))
         deviations, deviation, R = self._believed(plan)
         seen = None
         if mask is not None:
@@ -229,7 +234,7 @@ class SpanCarrier(Carrier):
             self._share = 1.0
         self._plan, self._seen, self._deviation, self._R = plan, seen, deviation, R
         observed = None if seen is None else seen.squeeze(-1)
-        self._measured = Measured(plan.values, observed, plan.mean, deviations, plan.rows)
+        self._measured = Measured(plan.values, observed, deviations, plan.rows)
         return self._measured
 
     def _believed(self, plan: Plan) -> tuple[Tensor, Tensor, Tensor]:

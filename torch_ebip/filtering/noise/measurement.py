@@ -12,7 +12,7 @@ from torch_ebip.filtering.noise.constraints import Positive
 from torch_ebip.recordings.layout import Layout
 
 if TYPE_CHECKING:
-    from torch_ebip.filtering.model import View
+    from torch_ebip.filtering.protocols import View
 
 
 @runtime_checkable

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch_ebip.common.draws import Generators
 
 if TYPE_CHECKING:
-    from torch_ebip.filtering.model import View
+    from torch_ebip.filtering.protocols import View
 
 
 class NoProcessNoise(nn.Module):

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from torch_ebip.common.arguments import as_number
 from torch_ebip.common.modules import sharing
 from torch_ebip.filtering.functional import Spread
-from torch_ebip.filtering.model import View
 from torch_ebip.filtering.noise.constraints import AboveOne
+from torch_ebip.filtering.protocols import View
 from torch_ebip.filtering.updates.part import Part
 from torch_ebip.recordings.layout import Layout
 

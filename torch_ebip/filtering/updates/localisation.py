@@ -8,8 +8,9 @@ from torch import Tensor
 from torch_ebip.common.ambient import owned
 from torch_ebip.common.modules import sharing
 from torch_ebip.filtering.functional import Taper
-from torch_ebip.filtering.model import StateSpace, View
+from torch_ebip.filtering.model import StateSpace
 from torch_ebip.filtering.noise.constraints import Positive
+from torch_ebip.filtering.protocols import View
 from torch_ebip.filtering.updates.part import Part
 from torch_ebip.recordings.layout import Layout
 

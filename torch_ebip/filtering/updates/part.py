@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 from torch import nn
 
-from torch_ebip.filtering.model import StateSpace, View
+from torch_ebip.filtering.model import StateSpace
+from torch_ebip.filtering.protocols import View
 from torch_ebip.recordings.layout import Layout
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch_ebip.common.arguments import as_number
 from torch_ebip.common.modules import sharing
 from torch_ebip.filtering.functional import Spread
-from torch_ebip.filtering.model import View
+from torch_ebip.filtering.protocols import View
 from torch_ebip.filtering.updates.inflation import SpreadRule
 
 if TYPE_CHECKING:

@@ -19,8 +19,8 @@ from torch import Tensor
 
 from torch_ebip.common.arguments import as_number
 from torch_ebip.common.modules import sharing
-from torch_ebip.filtering.model import View
 from torch_ebip.filtering.noise.constraints import Positive
+from torch_ebip.filtering.protocols import View
 from torch_ebip.filtering.updates.part import Part
 from torch_ebip.recordings.layout import Layout
 

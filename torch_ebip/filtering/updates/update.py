@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from torch_ebip.common.modules import sharing
 from torch_ebip.filtering.functional import Spread
-from torch_ebip.filtering.model import View
+from torch_ebip.filtering.protocols import View
 from torch_ebip.filtering.states import Memory
 from torch_ebip.filtering.updates.inflation import SpreadRule
 from torch_ebip.filtering.updates.localisation import Localisation
@@ -114,9 +115,13 @@ class Update(nn.Module):
             setattr(part, name, None if slot is None else slot.select(view))
         return part
 
-    @property
+    def __setattr__(self, name: str, value: Any) -> None:
+        super().__setattr__(name, value)
+        self.__dict__.pop("slots", None)
+
+    @cached_property
     def slots(self) -> Slots:
-        """The parts by their places."""
+        """The parts by their places; found once, until another is put in."""
         return Slots(self.rule, tuple(self.trust), self.weighting, self.localisation, self.inflation)  # type: ignore
 
     def forward(self, carrier: Carrier, measured: Measured, perturbations: Tensor | None) -> Tensor:
@@ -157,13 +162,13 @@ def analyse(slots: Slots, carrier: Carrier, measured: Measured, perturbations: T
 
 def _trusted(trust: Sequence[RobustWeights], carrier: Carrier, measured: Measured) -> tuple[Measured, Tensor]:
     """Values and deviations that deserve belief, and how much each value counts."""
-    observed, variance = measured.observed, carrier.variance()
+    observed, variance, mean = measured.observed, carrier.variance(), carrier.expected()
     y, deviation = measured.y, measured.deviation
     if observed is not None:
         y = torch.where(observed, y, 0)
     total: Tensor | None = None
     for weigh in trust:
-        y, deviation, counts = weigh(y, measured.mean, variance, deviation)
+        y, deviation, counts = weigh(y, mean, variance, deviation)
         total = counts if total is None else total * counts
     assert total is not None
     if observed is not None:
@@ -176,5 +181,5 @@ def _share(measured: Measured, counts: Tensor | None) -> Tensor:
     if counts is not None:
         return counts.amax(-1)
     if measured.observed is None:
-        return measured.mean.new_ones(measured.mean.shape[:-1])
-    return measured.observed.any(-1).to(measured.mean)
+        return measured.y.new_ones(measured.y.shape[:-1])
+    return measured.observed.any(-1).to(measured.y)

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from torch_ebip.common.arguments import as_number
 from torch_ebip.common.modules import FastTwins
-from torch_ebip.filtering.model import View
+from torch_ebip.filtering.protocols import View
 from torch_ebip.interaction.primitive import InteractionPrimitive
 
 
