@@ -129,3 +129,17 @@ def test_the_version_is_that_of_the_package() -> None:
     assert f"## [{torch_ebip.__version__}]" in (ROOT / "CHANGELOG.md").read_text()
     with pytest.raises(AttributeError, match="no attribute 'version'"):
         _ = torch_ebip.version
+
+
+def test_tuples_of_tensors_print_on_a_line() -> None:
+    """A trace used to print 14,000 characters; every NamedTuple that holds tensors says what it is instead."""
+    checked = 0
+    for path in (ROOT / "torch_ebip").rglob("*.py"):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef) and any(ast.unparse(base) == "NamedTuple" for base in node.bases):
+                fields = [ast.unparse(each.annotation) for each in node.body if isinstance(each, ast.AnnAssign)]
+                own = {each.name for each in node.body if isinstance(each, ast.FunctionDef)}
+                if any("Tensor" in field for field in fields):
+                    assert "__repr__" in own, f"{path}: {node.name}"
+                    checked += 1
+    assert checked > 15

@@ -17,8 +17,6 @@ from experiments.timing import Timing, interleaved, threads
 
 BATCH = 22
 """Interactions of a test fold."""
-OTHERS = ("live, batch", "live, weighted")
-"""Versions that do something else than `filter`: they are compared with it in the tests of the live path."""
 SLOW = {"loop": 7, "filterpy": 37}
 """Versions that take part in every k-th round only; no divisors of an interaction's length, to see all of it."""
 
@@ -53,6 +51,8 @@ def make(name: str, problem: Problem, seed: int, given: bool = False) -> Version
 
 def check(problem: Problem, names: list[str], steps: int = 5) -> dict[str, float]:
     """Largest difference of members from `EnsembleFilter`'s after some steps with the same draws, float64.
+
+    A batch has draws of its own, and weights are something else: they are compared in the tests of the live path.
 
     Raises:
         RuntimeError: a version that does not do the same; there is no point in timing it.
@@ -103,21 +103,24 @@ def live_size(rounds: int, seed: int) -> list[dict[str, Any]]:
     """The paper's live size, 1 thread, against everything there is: a row for each version."""
     rows = []
     for sensors in (10, 43):
-        names = ["live", "live, batch", "live, weighted", "filter", "loop", "numpy"]
+        names = ["live", "live, batch", "filter", "loop", "numpy"]
         names += ["filterpy"] if find_spec("filterpy") else []
         differences = check(
-            make_problem(559, 80, sensors, torch.float64, seed=seed), [n for n in names if n not in OTHERS]
+            make_problem(559, 80, sensors, torch.float64, seed=seed), [n for n in names if n != "live, batch"]
         )
         problem = make_problem(559, 80, sensors, torch.float32, seed=seed)
         with threads(1):
             # The floor finds warm caches only among its like: peers are timed in a group of their own.
             floors = compare(problem, ["live"], 3 * rounds, seed)
             timings = compare(problem, names, rounds, seed, bare=False)
+            weighted = compare(problem, ["live", "live, weighted"], rounds, seed, bare=False)
         over_floor = floors["live"].median / floors["floor"].median
         for name, timing in timings.items():
             ratio = timing.median / (BATCH if name == "live, batch" else 1) / timings["live"].median
             rows.append(_row(name, sensors, floors["live"] if name == "live" else timing, ratio, ratio * over_floor))
             rows[-1]["difference"] = differences.get(name)
+        ratio = weighted["live, weighted"].median / weighted["live"].median
+        rows.append(_row("live, weighted", sensors, weighted["live, weighted"], ratio, ratio * over_floor))
         for name in ("floor", "floor, whole state"):
             ratio = floors[name].median / floors["live"].median
             rows.append(_row(name, sensors, floors[name], ratio, ratio * over_floor))

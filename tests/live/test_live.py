@@ -332,3 +332,39 @@ def test_a_state_that_somebody_made_has_not_grown() -> None:
     state = EnsembleState(made.initial_state((2,)).members)
     kept = made(y, observed, state=state, keep=torch.tensor([[5], [0]])).kept
     torch.testing.assert_close(kept.memory.inflation.detach(), torch.tensor([[1.05**5], [1.0]]))
+
+
+@pytest.mark.parametrize("options", [OPTIONS["plain"], OPTIONS["all and robust"]], ids=["plain", "all"])
+def test_a_parameter_that_changes_is_noticed(options: dict[str, Any]) -> None:
+    """By an optimiser's step, by loading: the live filter goes on with what the filter has now."""
+    filter = ebip(small_primitive(torch.float64), **options)
+    y, observed = sequences()
+    generator = torch.Generator().manual_seed(1)
+    state = filter.initial_state(generator=generator)
+    live = LiveFilter(filter, HUMAN, generator=torch.Generator().manual_seed(1))
+    other = ebip(small_primitive(torch.float64), **options).state_dict()
+    for t in range(12):
+        with torch.no_grad():
+            if t in (3, 6):
+                for name, parameter in filter.named_parameters():
+                    parameter.add_(0.3 if t == 3 else -0.4 if "noise" in name else 0.1)
+            if t == 9:
+                filter.load_state_dict(other)
+            if t:
+                state = filter.predict(state, filter.dt, generator)
+                live.predict()
+            state, likelihood = filter.update(state, y[0, t], observed[0, t], generator)
+            torch.testing.assert_close(live.update(y[0, t], observed[0, t]), likelihood)
+    torch.testing.assert_close(live.state.members, state.members)
+
+
+def test_parameters_of_inference_mode_are_never_kept() -> None:
+    """They have no versions, so what depends on them is computed every time."""
+    with torch.inference_mode():
+        filter = ebip(small_primitive(torch.float64), weigh=True)
+        live = LiveFilter(filter, HUMAN, generator=torch.Generator().manual_seed(0))
+        y, observed = sequences()
+        for t in range(3):
+            live.predict()
+            live.update(y[0, t], observed[0, t])
+    assert live.finite

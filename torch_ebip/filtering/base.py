@@ -87,7 +87,6 @@ class Filter(Meaning, ABC):
     def moving(self, state: State) -> Tensor:
         """[..., m], mean of the entries that move: of all, unless the model says that some stand still."""
 
-    @eager
     def initial_state(
         self,
         batch_shape: tuple[int, ...] = (),
@@ -108,9 +107,9 @@ class Filter(Meaning, ABC):
             ValueError: a demonstration that there is not, or shapes that do not broadcast.
         """
         if members is not None:
-            warnings.warn("initial_state(members=) is now called demonstrations=", DeprecationWarning, stacklevel=3)
+            warnings.warn("initial_state(members=) is now called demonstrations=", DeprecationWarning, stacklevel=2)
             demonstrations = members
-        return self._start(batch_shape, demonstrations, generator)
+        return eager(self._start)(batch_shape, demonstrations, generator)
 
     def restrict(self, dofs: Tensor, stride: int = 1) -> Self:
         """The same filter for some of the DoFs, sharing its parameters: not a copy.
@@ -142,6 +141,21 @@ class Filter(Meaning, ABC):
         """What its tensors mean, see `Meaning`: of which DoFs they are, in this order, at which rate."""
         dofs = f"{self.n_dofs} of them" if self.dof_names is None else ", ".join(self.dof_names)
         return f"dofs={dofs}; dt={self.dt / self.stride:.9g}"
+
+    def __repr__(self) -> str:
+        names = self.dof_names
+        dofs = f"{self.n_dofs} DoFs" if names is None else f"{self.n_dofs} DoFs: {', '.join(names[:4])}"
+        more = ", ..." if names is not None and len(names) > 4 else ""
+        parts = ", ".join([self.extra_repr(), *self._parts()])
+        learned = sum(parameter.numel() for parameter in self.parameters())
+        return (
+            f"{type(self).__name__}({parts}, {dofs}{more}, {1 / self.dt:g} Hz, {learned} numbers to learn; "
+            "`.model`, `.prior` and so on print the rest)"
+        )
+
+    def _parts(self) -> list[str]:
+        """What the short description of a filter names beside its settings."""
+        return []
 
     @eager
     def predict(self, state: State, dt: float | Tensor, generator: Generators = None) -> State:

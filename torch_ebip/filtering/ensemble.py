@@ -128,6 +128,10 @@ class EnsembleFilter(MemberFilter):
             *filter_in_place(self.model, self.analysis, y, observed, dt, state, generator, keep, project), "span"
         )
 
+    def _parts(self) -> list[str]:
+        """See `Filter._parts`."""
+        return [type(part).__name__ for part in self.analysis.parts]
+
     def extra_repr(self) -> str:
         """The options that are not modules."""
         return f"n_members={self.n_members}, stride={self.stride}"

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_ebip.common.ambient import eager
+from torch_ebip.common.brief import brief
 from torch_ebip.common.draws import Generators
 from torch_ebip.filtering.base import Filter
 from torch_ebip.filtering.functional import FactorisationError, add_product, cholesky
@@ -58,7 +59,7 @@ class GaussianState(NamedTuple):
     covariance: Tensor
 
     def __repr__(self) -> str:
-        return f"GaussianState(mean {list(self.mean.shape)}, {self.mean.dtype})"
+        return brief(self)
 
 
 class ExtendedFilter(Filter):
@@ -158,6 +159,10 @@ class ExtendedFilter(Filter):
     def moving(self, state: GaussianState) -> Tensor:
         """[..., m], of the mean of a state; see `Filter.moving`."""
         return self.model.split(state.mean)[0]
+
+    def _parts(self) -> list[str]:
+        """See `Filter._parts`."""
+        return [type(trust).__name__ for trust in self.trust]
 
     def extra_repr(self) -> str:
         """The options that are not modules."""

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_ebip.common.arguments import as_number
+from torch_ebip.common.brief import brief
 from torch_ebip.common.draws import Generators, uniform
 from torch_ebip.filtering import functional
 from torch_ebip.filtering.members import MemberFilter
@@ -28,6 +29,9 @@ class ParticleState(NamedTuple):
 
     members: Tensor
     log_weights: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self)
 
     @property
     def weights(self) -> Tensor:
@@ -48,9 +52,6 @@ class ParticleState(NamedTuple):
     def effective_size(self) -> Tensor:
         """[...], 1 / sum_j w_j^2: E for equal weights, 1 where one particle has it all."""
         return torch.exp(-torch.logsumexp(2 * self.log_weights, dim=-1))
-
-    def __repr__(self) -> str:
-        return f"ParticleState(members {list(self.members.shape)}, {self.members.dtype})"
 
 
 class ParticleFilter(MemberFilter):
@@ -151,6 +152,10 @@ class ParticleFilter(MemberFilter):
     def _narrow(self, view: View) -> None:
         """See `Filter._narrow`."""
         self.trust = nn.ModuleList([trust.select(view) for trust in self.trust])  # type: ignore[operator]
+
+    def _parts(self) -> list[str]:
+        """See `Filter._parts`."""
+        return [type(trust).__name__ for trust in self.trust]
 
     def extra_repr(self) -> str:
         """The options that are not modules."""

@@ -10,6 +10,8 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from torch import Tensor
 
+from torch_ebip.common.brief import brief
+
 
 class View(NamedTuple):
     """Some of a model.
@@ -23,6 +25,9 @@ class View(NamedTuple):
     dofs: Tensor
     state: Tensor
     stride: int = 1
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 @runtime_checkable

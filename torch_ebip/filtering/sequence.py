@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from torch_ebip.common.brief import brief
 from torch_ebip.common.draws import Generators, replayed, set_states, states_of
 from torch_ebip.filtering.states import State, map_state
 
@@ -36,6 +37,9 @@ class Segment(NamedTuple):
     log_likelihood: list[Tensor]
     projection: list[Tensor]
     kept: list[tuple[tuple[int, ...], State]]
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 def checkpointed(run: Callable[..., Segment], state: State, start: int, stop: int, generator: Generators) -> Segment:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
+from torch_ebip.common.brief import brief
 from torch_ebip.filtering import functional
 
 State = Any
@@ -37,6 +38,9 @@ class Memory(NamedTuple):
     inflation: Tensor | None = None
     origin: Tensor | None = None
 
+    def __repr__(self) -> str:
+        return brief(self)
+
 
 class EnsembleState(NamedTuple):
     """An ensemble.
@@ -60,6 +64,9 @@ class EnsembleState(NamedTuple):
     memory: Memory = Memory()
     centre: Tensor | None = None
 
+    def __repr__(self) -> str:
+        return brief(self)
+
     @property
     def members(self) -> Tensor:
         """[..., E, n], with the centre."""
@@ -81,6 +88,3 @@ class EnsembleState(NamedTuple):
     def covariance(self) -> Tensor:
         """[..., n, n], A'A / (E - 1), or its weighted form."""
         return functional.ensemble_covariance(self.deviations, self.weights)
-
-    def __repr__(self) -> str:
-        return f"EnsembleState(members {list(self.deviations.shape)}, {self.deviations.dtype})"

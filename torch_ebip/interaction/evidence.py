@@ -20,6 +20,7 @@ from torch import Tensor
 
 from torch_ebip.common.ambient import owned
 from torch_ebip.common.arguments import as_number
+from torch_ebip.common.brief import brief
 from torch_ebip.common.modules import Versions, sharing
 from torch_ebip.filtering.model import StateSpace
 from torch_ebip.filtering.noise.constraints import Positive
@@ -42,6 +43,9 @@ class Evidence(NamedTuple):
     misfit: Tensor
     seen: Tensor
 
+    def __repr__(self) -> str:
+        return brief(self)
+
 
 class _Constants(NamedTuple):
     """What depends on parameters alone.
@@ -57,6 +61,9 @@ class _Constants(NamedTuple):
     sharpness: Tensor
     slope: Tensor
     prior: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 class EvidenceWeighting(Weighting):

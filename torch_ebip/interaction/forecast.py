@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torch_ebip.common.brief import brief
 from torch_ebip.filtering.functional import scores
 
 
@@ -29,6 +30,9 @@ class Forecast(NamedTuple):
     members: Tensor | None = None
     weights: Tensor | None = None
     fair: bool = True
+
+    def __repr__(self) -> str:
+        return brief(self)
 
     def select(self, dofs: Tensor) -> Forecast:
         """The forecast of some DoFs: bool [D] or indices int64 [k]."""

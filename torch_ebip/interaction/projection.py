@@ -8,6 +8,7 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torch_ebip.common.brief import brief
 from torch_ebip.common.modules import FastTwins
 from torch_ebip.filtering.carriers.columns import ColumnMembers
 from torch_ebip.filtering.protocols import View
@@ -97,6 +98,9 @@ class _Range(NamedTuple):
     centre: Tensor | None  # to which they are deviations, [..., k, F]; None where it is 0
     terms: Tensor  # buffer of the same shape
     projections: Tensor  # [..., k, E], view of the buffer
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 class _Projector:

@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from torch_ebip.common.brief import brief
 from torch_ebip.kinematics.urdf import UrdfJoint, Vector
 
 
@@ -46,6 +47,9 @@ class Chain(NamedTuple):
     sources: Tensor
     multipliers: Tensor
     shifts: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 def pose_of(joints: Tensor, chain: Chain) -> Tensor:

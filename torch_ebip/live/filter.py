@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torch_ebip.common.ambient import in_own_modes
 from torch_ebip.common.arguments import as_mask, as_number, as_values
+from torch_ebip.common.brief import brief
 from torch_ebip.common.draws import Generators, set_states, states_of
 from torch_ebip.filtering.carriers.checks import measured_dofs
 from torch_ebip.filtering.carriers.plan import kept
@@ -39,7 +40,7 @@ class LiveSnapshot(NamedTuple):
     generators: list[Tensor]
 
     def __repr__(self) -> str:
-        return f"LiveSnapshot(matrix {list(self.matrix.shape)}, {len(self.generators)} generators)"
+        return brief(self)
 
 
 class LiveFilter:

@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from torch_ebip.common.brief import brief
+
 
 class SessionForecast(NamedTuple):
     """What a session expects.
@@ -26,3 +28,6 @@ class SessionForecast(NamedTuple):
     mean: Tensor
     deviation: Tensor
     stale: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        return brief(self)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torch_ebip.common.brief import brief
 from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.live.forecast import SessionForecast
@@ -38,6 +39,9 @@ class Replay(NamedTuple):
     session: InteractionSession
     forecasts: list[SessionForecast]
     recorded: list[Tensor]
+
+    def __repr__(self) -> str:
+        return brief(self)
 
     @property
     def identical(self) -> bool:

@@ -80,6 +80,7 @@ class InteractionSession:
                 raise ValueError(f"{name!r} is controlled by the robot, not a sensor")
         if not sensors:
             raise ValueError("a session needs at least one sensor")
+        self._filter = filter
         self.settings = settings = SessionSettings() if settings is None else settings
         self.sensors, self.dt = tuple(sensors), filter.dt
         self.dofs = tuple(dof for dof, ours in zip(layout.dofs, layout.controlled.tolist(), strict=True) if ours)
@@ -209,6 +210,12 @@ class InteractionSession:
         with self._lock:
             if self._log is not None:
                 self._log.close()
+
+    def __repr__(self) -> str:
+        return (
+            f"InteractionSession({type(self._filter).__name__}, {', '.join(self.sensors)} -> {', '.join(self.dofs)}, "
+            f"at {self._now:g} s)"
+        )
 
     def __enter__(self) -> InteractionSession:
         return self

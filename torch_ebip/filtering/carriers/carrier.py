@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from torch_ebip.common.brief import brief
 from torch_ebip.filtering.functional import Spread, Taper
 from torch_ebip.filtering.states import Memory
 from torch_ebip.filtering.updates.rules import Rule
@@ -26,6 +27,9 @@ class Measured(NamedTuple):
     observed: Tensor | None
     deviation: Tensor
     rows: Tensor | None
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 class Carrier(ABC):

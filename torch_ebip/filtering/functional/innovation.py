@@ -16,6 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torch_ebip.common.brief import brief
 from torch_ebip.filtering.functional.linear import cholesky
 from torch_ebip.filtering.functional.moments import centred, member_shares
 
@@ -30,6 +31,9 @@ class Taper(NamedTuple):
 
     state: Tensor
     observation: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self)
 
     def select(self, rows: Tensor | None) -> Taper:
         """The factors of some rows of the observation, int64 [k]; None for all."""
@@ -63,6 +67,9 @@ class Innovation(NamedTuple):
     factor: Tensor
     noise: Tensor
     observed: Tensor | None
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 def innovation_of(

@@ -11,6 +11,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from torch_ebip.common.ambient import without_autocast
+from torch_ebip.common.brief import brief
 
 
 class Centred(NamedTuple):
@@ -25,6 +26,9 @@ class Centred(NamedTuple):
     anomalies: Tensor
     reference: Tensor
     shift: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 def centred(members: Tensor, weights: Tensor | None = None) -> Centred:

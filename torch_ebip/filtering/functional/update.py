@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from torch_ebip.common.ambient import without_autocast
+from torch_ebip.common.brief import brief
 from torch_ebip.filtering.functional.innovation import Innovation, Taper, innovation_of, log_likelihood
 from torch_ebip.filtering.functional.linear import add_product, cholesky
 
@@ -35,6 +36,9 @@ class Spread(NamedTuple):
 
     scale: Tensor | None = None
     keep: Tensor | None = None
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 @without_autocast

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torch_ebip.common.brief import brief
 from torch_ebip.filtering import functional
 from torch_ebip.filtering.functional import Innovation
 from torch_ebip.filtering.updates.part import Part
@@ -39,6 +40,9 @@ class Columns(NamedTuple):
     right_members: Tensor
     moves: Tensor
     shift: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 class Rule(Part, ABC):

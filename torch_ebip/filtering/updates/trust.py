@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from torch_ebip.common.arguments import as_number
+from torch_ebip.common.brief import brief
 from torch_ebip.common.modules import sharing
 from torch_ebip.filtering.noise.constraints import Positive
 from torch_ebip.filtering.protocols import View
@@ -45,6 +46,9 @@ class Trusted(NamedTuple):
     y: Tensor
     deviation: Tensor
     weight: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 class RobustWeights(Part, ABC):

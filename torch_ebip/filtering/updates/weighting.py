@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, Protocol
 
 from torch import Tensor
 
+from torch_ebip.common.brief import brief
 from torch_ebip.filtering.updates.part import Part
 
 
@@ -38,6 +39,9 @@ class Seen(NamedTuple):
     moving: Tensor
     mean: Tensor
     origin: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 class Weighting(Part, ABC):

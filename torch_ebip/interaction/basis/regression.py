@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_ebip.common.ambient import without_autocast
+from torch_ebip.common.brief import brief
 from torch_ebip.interaction.basis.base import Basis
 from torch_ebip.recordings.demonstrations import Demonstrations
 
@@ -30,6 +31,9 @@ class Samples(NamedTuple):
     values: Tensor
     observed: Tensor
     weight: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 def samples_of(demonstrations: Demonstrations) -> Samples:
@@ -67,6 +71,9 @@ class Fit(NamedTuple):
 
     weights: Tensor
     residuals: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 @without_autocast
