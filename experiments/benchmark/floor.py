@@ -14,12 +14,14 @@ import torch
 from experiments.benchmark.problem import FUNCTIONS, Problem
 
 
-def floor(problem: Problem, whole: bool = False) -> Callable[[], None]:
+def floor(problem: Problem, whole: bool = False, weigh: bool = False) -> Callable[[], None]:
     """One bare step.
 
     Args:
         problem: for its sizes and dtype.
         whole: update all of the state, without the transform.
+        weigh: with what evidence weights need: looking up where each member's demonstration is, at five phases near
+            its own, between points of the table; distances, their likelihood, the weights, and weighted anomalies.
     """
     E, D = problem.filter.n_members, int(problem.sensors.sum())
     seen = D * FUNCTIONS
@@ -41,8 +43,28 @@ def floor(problem: Problem, whole: bool = False) -> Callable[[], None]:
     cholesky, info = empty(D, D), torch.empty((), dtype=torch.int32)
     right, solved, cross = drawn(E, D).T, empty(E, D).T, empty(rows, D)
 
+    cells, near = drawn(E * 40, 4 * D), torch.randint(E * 40, (5 * E,), generator=generator)
+    t, scale, y = drawn(5 * E, 1), drawn(D).abs(), drawn(D)
+    found, path, distance = empty(5 * E, 4 * D), empty(5 * E, D), empty(5 * E)
+    likelihood, shares, weighted = empty(E), empty(E), empty(D, E)
+
+    @torch.no_grad()
+    def evidence() -> None:
+        torch.index_select(cells, 0, near, out=found)
+        a, b, c, d = found.view(5 * E, 4, D).unbind(1)
+        torch.addcmul(c, t, d, out=path)
+        torch.addcmul(b, t, path, out=path)
+        torch.addcmul(a, t, path, out=path)
+        path.sub_(y).square_()
+        torch.mv(path, scale, out=distance)
+        torch.logsumexp(distance.view(E, 5), -1, out=likelihood)
+        torch.softmax(likelihood, -1, out=shares)
+        torch.mul(anomalies, shares, out=weighted)
+
     @torch.no_grad()
     def step() -> None:
+        if weigh:
+            evidence()
         phase_draws.normal_(generator=generator)
         moving.addmm_(factor, phase_draws.T)
         torch.mul(weights, features, out=terms)

@@ -75,8 +75,19 @@ def _run(version: Version, problem: Problem, steps: int) -> torch.Tensor:
     return version.members()
 
 
-def compare(problem: Problem, names: list[str], rounds: int, seed: int = 0, bare: bool = True) -> dict[str, Timing]:
-    """Time versions, and with ``bare`` the floors, in turn along the interaction, which begins again at its end."""
+def compare(
+    problem: Problem, names: list[str], rounds: int, seed: int = 0, bare: bool = True, weigh: bool = False
+) -> dict[str, Timing]:
+    """Time versions in turn along the interaction, which begins again at its end.
+
+    Args:
+        problem: the interaction.
+        names: of the versions.
+        rounds: calls that count.
+        seed: of the draws.
+        bare: time the floors, too.
+        weigh: among them that of a step with evidence weights.
+    """
     samples = problem.y[:, problem.sensors].unbind(0)
     now: dict[str, Any] = {"y": samples[0]}
 
@@ -96,6 +107,8 @@ def compare(problem: Problem, names: list[str], rounds: int, seed: int = 0, bare
     actions: dict[str, Callable[[], object]] = {name: action(name) for name in names}
     if bare:
         actions |= {"floor": floor(problem), "floor, whole state": floor(problem, whole=True)}
+    if weigh:
+        actions |= {"floor, weighted": floor(problem, weigh=True)}
     return interleaved(actions, rounds, SLOW, before, warmup=20)
 
 
@@ -113,14 +126,15 @@ def live_size(rounds: int, seed: int) -> list[dict[str, Any]]:
             # The floor finds warm caches only among its like: peers are timed in a group of their own.
             floors = compare(problem, ["live"], 3 * rounds, seed)
             timings = compare(problem, names, rounds, seed, bare=False)
-            weighted = compare(problem, ["live", "live, weighted"], rounds, seed, bare=False)
+            weighted = compare(problem, ["live, weighted"], rounds, seed, weigh=True)
         over_floor = floors["live"].median / floors["floor"].median
         for name, timing in timings.items():
             ratio = timing.median / (BATCH if name == "live, batch" else 1) / timings["live"].median
             rows.append(_row(name, sensors, floors["live"] if name == "live" else timing, ratio, ratio * over_floor))
             rows[-1]["difference"] = differences.get(name)
-        ratio = weighted["live, weighted"].median / weighted["live"].median
-        rows.append(_row("live, weighted", sensors, weighted["live, weighted"], ratio, ratio * over_floor))
+        for name in ("live, weighted", "floor, weighted"):
+            ratio = weighted[name].median / weighted["floor"].median
+            rows.append(_row(name, sensors, weighted[name], ratio / over_floor, ratio))
         for name in ("floor", "floor, whole state"):
             ratio = floors[name].median / floors["live"].median
             rows.append(_row(name, sensors, floors[name], ratio, ratio * over_floor))

@@ -45,6 +45,7 @@ def test_the_problem_has_the_size_of_the_paper() -> None:
     assert problem.y.shape == (100, 43)
     floor(problem)()
     floor(problem, whole=True)()
+    floor(problem, weigh=True)()
 
 
 def test_growth_reports_every_size(monkeypatch: pytest.MonkeyPatch) -> None:
