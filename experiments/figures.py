@@ -136,7 +136,7 @@ def noise_figure(filter: Filter, closed_form: Tensor, layout: Layout, shown: Seq
     figure, axis = plt.subplots(figsize=(6, 3.5), layout="constrained")
     phases = torch.linspace(0, 1, 100)
     with torch.no_grad():
-        variance = noise(phases).square().expand(100, -1)
+        variance = noise(phases.unsqueeze(-1)).square().expand(100, -1)
     for name in shown:
         part = layout.slice(name)
         ratio = (variance[:, part] / closed_form[part]).log().mean(-1).exp()

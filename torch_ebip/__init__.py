@@ -5,6 +5,7 @@ layer for any dynamics and any measurement.
 """
 
 from torch_ebip.common.exports import exported as _exported
+from torch_ebip.common.former import keep_former_paths as _keep_former_paths
 from torch_ebip.filtering import (
     AboveOne,
     EnsembleFilter,
@@ -136,6 +137,8 @@ __all__ = [
 ]
 __all__ += _exported(vars(_updates))
 __all__ += _exported(vars(_phases))
+
+_keep_former_paths()
 
 
 def __getattr__(name: str) -> str:

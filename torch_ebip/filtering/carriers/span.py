@@ -85,7 +85,7 @@ class SpanCarrier(Carrier):
         self._equal = start.new_full((*self.batch_shape, E, 1), 1 / E)
         self._terms = start.new_empty(math.prod(self.batch_shape) * len(seen) * E)
         self._plans: OrderedDict[tuple[bool, ...], Plan | None] = OrderedDict()
-        self._noise, self._noise_versions = None, Versions(part.measurement_noise)
+        self._noise_versions = Versions(part.measurement_noise)
         self._step_factor: tuple[float, Tensor, Tensor] | None = None
         self._process_versions = Versions(part.process_noise)
         batched = bool(self.batch_shape)
