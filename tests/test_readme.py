@@ -36,6 +36,15 @@ def test_the_python_runs() -> None:
     subprocess.run([sys.executable, "-c", "\n".join(blocks)], check=True, cwd=ROOT)
 
 
+@pytest.mark.parametrize("page", sorted(path.name for path in (ROOT / "docs").glob("*.md")))
+def test_the_python_of_a_page_runs(page: str) -> None:
+    text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+    blocks = re.findall(r"^```python\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
+    assert blocks or page != "extending.md"
+    if blocks:
+        subprocess.run([sys.executable, "-c", "\n".join(blocks)], check=True, cwd=ROOT)
+
+
 def test_the_description_of_a_folder_is_read(tmp_path: Path) -> None:
     (block,) = _blocks("toml")
     (tmp_path / "layout.toml").write_text(block, encoding="utf-8")

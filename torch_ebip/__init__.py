@@ -62,6 +62,8 @@ from torch_ebip.interaction import (
 from torch_ebip.interaction.phases import *
 from torch_ebip.kinematics import RobotArm
 from torch_ebip.learning import (
+    CRPSLoss,
+    EnergyScoreLoss,
     ForecastObjective,
     ForwardKinematicsLoss,
     InnovationLikelihoodLoss,
@@ -79,9 +81,11 @@ __all__ = [
     "BSplineBasis",
     "Basis",
     "BasisProjection",
+    "CRPSLoss",
     "DemonstrationPrior",
     "DemonstrationTable",
     "Demonstrations",
+    "EnergyScoreLoss",
     "EnsembleFilter",
     "EnsembleState",
     "EvidenceWeighting",
