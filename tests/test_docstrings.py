@@ -7,6 +7,7 @@ or of a property is that of a quantity. "See `that`" and "as `that`" take in wha
 
 from __future__ import annotations
 
+import doctest
 import importlib
 import inspect
 import pkgutil
@@ -195,3 +196,12 @@ def test_every_docstring_of_tensors_needs_its_shapes() -> None:
         if tensors and not REFERENCE.search(documented.docstring):
             bare = documented._replace(docstring=SHAPE.sub("", documented.docstring))
             assert any("shape" in complaint for complaint in _complaints(bare)), documented.name
+
+
+def test_the_examples_of_docstrings_run() -> None:
+    tried = 0
+    for module in pkgutil.walk_packages(torch_ebip.__path__, "torch_ebip."):
+        result = doctest.testmod(importlib.import_module(module.name))
+        assert not result.failed, module.name
+        tried += result.attempted
+    assert tried > 30

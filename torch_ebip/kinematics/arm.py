@@ -35,8 +35,10 @@ class RobotArm(Meaning):
     `joint_names` is a tuple in the order of the joint vector: joints that mimic another are not in it.
 
     Example:
+        >>> import torch
+        >>> from torch_ebip import RobotArm
         >>> RobotArm.ur5()(torch.zeros(6))[:3, 3]  # the flange, metres
-        tensor([-0.8173, -0.1915, -0.0055])
+        tensor([-0.8173, -0.1914, -0.0055])
     """
 
     tool: Tensor
