@@ -16,6 +16,7 @@ from torch_ebip import (
     GaussianPrior,
     Huber,
     Inflation,
+    InteractionFilter,
     InteractionNoise,
     LiveFilter,
     MeasurementNoise,
@@ -34,7 +35,7 @@ from torch_ebip import (
 )
 from torch_ebip.filtering.updates import Rule
 from torch_ebip.filtering.updates.rules import Columns
-from torch_ebip.interaction import InteractionEnsembleFilter, InteractionFilter
+from torch_ebip.interaction import InteractionEnsembleFilter
 
 HUMAN = torch.tensor([True, True, True, False, False])
 PRIMITIVE = small_primitive(torch.float64)

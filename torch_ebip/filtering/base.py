@@ -252,12 +252,11 @@ class Filter(Meaning, ABC):
         if engine not in ("auto", "dense", "span"):
             raise ValueError(f'engine must be "auto", "dense" or "span", got {engine!r}')
         if engine != "dense":
-            reason = self._why_not_span(y, dt, state)
-            if reason is None:
-                seconds = self.dt if dt is None else float(dt)
-                return self._through_span(y, observed, seconds, state, generator, keep, project)
+            done = self._through_span(y, observed, dt, state, generator, keep, project)
+            if isinstance(done, Trace):
+                return done
             if engine == "span":
-                raise ValueError(f'engine="span" cannot serve this: {reason}')
+                raise ValueError(f'engine="span" cannot serve this: {done}')
 
         return self._trace(
             *filter_step_by_step(self, y, observed, step, state, generator, keep, segment, project), "dense"
@@ -279,19 +278,15 @@ class Filter(Meaning, ABC):
             engine: EngineName = "auto",
         ) -> Trace: ...
 
-    def _why_not_span(self, y: Tensor, dt: float | Tensor | None, state: State) -> str | None:
-        """Why a sequence that was checked cannot be filtered by the span engine; None if it can."""
-        return f"a {type(self).__name__} has the dense engine only"
-
     def _through_span(
         self,
         y: Tensor,
         observed: Tensor,
-        dt: float,
+        dt: float | Tensor | None,
         state: State,
         generator: Generators,
         keep: Tensor | None,
         project: bool,
-    ) -> Trace:
-        """`forward` by the span engine, which was found able to serve."""
-        raise NotImplementedError
+    ) -> Trace | str:
+        """`forward` by the span engine, of arguments that were checked; or why that cannot serve."""
+        return f"a {type(self).__name__} has the dense engine only"

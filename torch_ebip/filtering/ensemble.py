@@ -100,7 +100,7 @@ class EnsembleFilter(MemberFilter):
         return why_not_span(self.model, self.analysis) is None
 
     def _why_not_span(self, y: Tensor, dt: float | Tensor | None, state: EnsembleState) -> str | None:
-        """See `Filter._why_not_span`."""
+        """Why a sequence that was checked cannot be filtered by the span engine; None if it can."""
         if torch.is_grad_enabled():
             return "gradients are recorded, which it has none of: use torch.no_grad()"
         if (state.memory.weighting is None) != (self.analysis.weighting is None):
@@ -117,16 +117,19 @@ class EnsembleFilter(MemberFilter):
         self,
         y: Tensor,
         observed: Tensor,
-        dt: float,
+        dt: float | Tensor | None,
         state: EnsembleState,
         generator: Generators,
         keep: Tensor | None,
         project: bool,
-    ) -> Trace:
+    ) -> Trace | str:
         """See `Filter._through_span`."""
-        return self._trace(
-            *filter_in_place(self.model, self.analysis, y, observed, dt, state, generator, keep, project), "span"
-        )
+        reason = self._why_not_span(y, dt, state)
+        if reason is not None:
+            return reason
+        seconds = self.dt if dt is None else float(dt)
+        done = filter_in_place(self.model, self.analysis, y, observed, seconds, state, generator, keep, project)
+        return self._trace(*done, "span")
 
     def _parts(self) -> list[str]:
         """See `Filter._parts`."""

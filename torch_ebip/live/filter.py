@@ -47,7 +47,8 @@ class LiveFilter:
     """An ensemble filter at work on one interaction, or on a batch of them in step.
 
     Its state is its own and changes with `predict` and `update`; `state` gives a copy that the filter understands.
-    What depends on parameters is computed again when one of them has changed.
+    What depends on parameters is computed again when one of them has changed; of a change through ``.data`` torch
+    keeps no record, and a part of the filter that is exchanged is not looked for: make a new one.
 
     Args:
         filter: made by `ebip` or `ebip_minus`.

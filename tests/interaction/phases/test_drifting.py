@@ -8,8 +8,16 @@ from torch import Tensor
 from tests.conftest import interactions, small_primitive
 from tests.filtering.contract import FilterContract
 from tests.interaction.test_ebip import silent
-from torch_ebip import DriftingPhase, InteractionSession, LiveFilter, bip, ebip, ebip_minus, particle_filter
-from torch_ebip.interaction import InteractionFilter
+from torch_ebip import (
+    DriftingPhase,
+    InteractionFilter,
+    InteractionSession,
+    LiveFilter,
+    bip,
+    ebip,
+    ebip_minus,
+    particle_filter,
+)
 
 HUMAN = torch.tensor([True, True, True, False, False])
 
