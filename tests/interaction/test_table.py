@@ -1,5 +1,7 @@
 """The table of demonstrations against the demonstrations' own regressions."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -53,5 +55,9 @@ def test_what_is_kept_follows_the_table() -> None:
     torch.testing.assert_close(table.at(which, phase.double(), dofs), 2 * before.double())
     part = ebip(primitive, weigh=True).restrict(torch.tensor([False, True, False, True, False]))
     torch.testing.assert_close(part.analysis.weighting.table.at(which, phase), before)
+    table.at(which, phase.double(), dofs)
+    other = copy.deepcopy(table)
+    other.cells.mul_(0.5)  # as often changed as the first one was
+    torch.testing.assert_close(other.at(which, phase.double(), dofs), before.double())
     with pytest.raises(ValueError, match="with at least 2 phases"):
         DemonstrationTable(torch.zeros(3, 1, 2), torch.zeros(3, 1, 2))

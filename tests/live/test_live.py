@@ -1,6 +1,8 @@
 """The live path gives the numbers of the differentiable one, whatever it keeps and whatever it puts off."""
 
+import copy
 import gc
+import pickle
 import weakref
 from collections import OrderedDict
 from typing import Any
@@ -368,3 +370,55 @@ def test_parameters_of_inference_mode_are_never_kept() -> None:
             live.predict()
             live.update(y[0, t], observed[0, t])
     assert live.finite
+
+
+def others(filter: EnsembleFilter, way: str) -> EnsembleFilter:
+    """The same filter, used before, with other parameters that came in some way."""
+    with torch.no_grad():
+        filter(sequences()[0], project=False)
+        if way == "copied":
+            filter = copy.deepcopy(filter)
+        if way == "pickled":
+            filter = pickle.loads(pickle.dumps(filter))
+        if way == "assigned":
+            state = {name: v + 0.5 if name.endswith("raw") else v for name, v in filter.state_dict().items()}
+            filter.load_state_dict(state, assign=True)
+        else:
+            for parameter in filter.parameters():
+                parameter.add_(0.5)
+    if way == "exchanged":
+        filter.analysis.trust[0] = Huber(1.0).double()
+    return filter
+
+
+@pytest.mark.parametrize("way", ["copied", "pickled", "assigned", "exchanged"])
+def test_parameters_are_those_of_now_however_they_came(way: str) -> None:
+    """What was kept for a filter of before, or for other tensors, is never taken for theirs."""
+    y, observed = sequences()
+    filter = ebip(small_primitive(torch.float64), **OPTIONS["all and robust"])
+    with torch.no_grad():
+        for parameter in filter.parameters():
+            parameter.add_(0.1)
+    filter = others(filter, way)
+    expected = filter(y, observed, generator=torch.Generator().manual_seed(0))
+    live = LiveFilter(filter, None, (3,), generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(run(live, y, observed), expected.log_likelihood)
+    with torch.no_grad():
+        for engine in ("dense", "span"):
+            found = filter(y, observed, generator=torch.Generator().manual_seed(0), engine=engine)
+            torch.testing.assert_close(found.log_likelihood, expected.log_likelihood)
+
+
+def test_a_live_filter_notices_assigned_parameters() -> None:
+    filter = ebip(small_primitive(torch.float64), weigh=True)
+    y, observed = sequences()
+    live = LiveFilter(filter, HUMAN, generator=torch.Generator().manual_seed(0))
+    live.update(y[0, 0], observed[0, 0])
+    others(filter, "assigned")
+    state, generator = live.state, torch.Generator().manual_seed(7)
+    live.generator.set_state(generator.get_state())
+    live.predict()
+    with torch.no_grad():
+        state = filter.predict(state, filter.dt, generator)
+        _, expected = filter.update(state, y[0, 1], observed[0, 1], generator)
+    torch.testing.assert_close(live.update(y[0, 1], observed[0, 1]), expected)

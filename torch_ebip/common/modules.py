@@ -38,22 +38,24 @@ class FastTwins:
 
 
 class Versions:
-    """Notices that parameters or buffers of a module have changed in place, as an optimiser or loading does.
+    """Notices that parameters or buffers of a module are others, or have changed in place, as by an optimiser.
 
     Args:
-        module: whose tensors are watched, those that it has now.
+        module: that is watched, with the parts that it has now.
     """
 
     def __init__(self, module: nn.Module) -> None:
-        self._tensors = [*module.parameters(), *module.buffers()]
-        self._unversioned = any(tensor.is_inference() for tensor in self._tensors)
-        self._seen: list[int] | None = None
+        registries = [registry for part in module.modules() for registry in (part._parameters, part._buffers)]
+        self._places = [(registry, name) for registry in registries for name, value in registry.items()]
+        self._seen: list[tuple[int, int]] | None = None
 
     def changed(self) -> bool:
         """Whether something has, since the last call; always at first, and where torch keeps no versions."""
-        if self._unversioned:
+        tensors = [registry[name] for registry, name in self._places]
+        try:
+            now = [(id(tensor), -1 if tensor is None else tensor._version) for tensor in tensors]
+        except RuntimeError:  # of inference mode: they have none
             return True
-        now = [tensor._version for tensor in self._tensors]
         if now == self._seen:
             return False
         self._seen = now

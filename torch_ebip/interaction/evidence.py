@@ -12,8 +12,8 @@ Where the demonstrations are comes from a `DemonstrationTable`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -133,9 +133,11 @@ class EvidenceWeighting(Weighting):
         self.wander = Positive(variance.new_tensor(wander))
         self.register_buffer("offsets", owned(variance.new_tensor(offsets)))
         self.defensive = defensive
-        self._forget_kept()
+        self._at_work = False
 
-    def _forget_kept(self) -> None:
+    def at_work(self) -> None:
+        """See `Weighting.at_work`. Otherwise nothing is kept: a module may be copied, or given other parameters."""
+        self._at_work = True
         self._kept: dict[tuple[int, ...] | None, _Constants] = {}
         self._versions = Versions(self)
         self._discounted: tuple[Tensor, Tensor] | None = None
@@ -156,7 +158,7 @@ class EvidenceWeighting(Weighting):
         part.table = self.table.select(view)
         part.register_buffer("variance", self.variance[view.dofs])
         part.register_buffer("modality_of_dof", self.modality_of_dof[view.dofs])
-        part._forget_kept()
+        part._at_work = False
         return part
 
     def named_values(self, layout: Layout) -> dict[str, float]:
@@ -184,7 +186,7 @@ class EvidenceWeighting(Weighting):
 
     def _discount(self, dt: Tensor) -> Tensor:
         """What is left after dt [...] seconds; kept for the same tensor while the parameters stay as they are."""
-        if torch.is_grad_enabled():
+        if not self._at_work:
             return torch.exp(-self.forgetting.value * dt)
         if self._forgetting_versions.changed() or self._discounted is None or self._discounted[0] is not dt:
             self._discounted = dt, torch.exp(-self.forgetting.value * dt)
@@ -232,7 +234,7 @@ class EvidenceWeighting(Weighting):
 
     def _constants(self, rows: Tensor | None) -> _Constants:
         """What depends on parameters alone, for some DoFs int64 [k]; kept while they stay as they are."""
-        if torch.is_grad_enabled():
+        if not self._at_work:
             return self._computed(rows)
         if self._versions.changed():
             self._kept.clear()
@@ -250,9 +252,3 @@ class EvidenceWeighting(Weighting):
         scale = torch.where(variance > 0, self.factor.value[modality] / torch.where(variance > 0, variance, 1), 0)
         prior = torch.log_softmax(-0.5 * (self.offsets / self.wander.value).square(), -1)
         return _Constants(scale / len(variance), 0.5 * self.sharpness.value, self.slope.value, prior)
-
-    def _apply(self, fn: Callable[..., Any], recurse: bool = True) -> EvidenceWeighting:
-        """Of `nn.Module`, which calls it to move a module: what was computed before is of another dtype or device."""
-        self._kept.clear()
-        self._discounted = None
-        return super()._apply(fn, recurse)  # type: ignore[no-any-return, no-untyped-call]

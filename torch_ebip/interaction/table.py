@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections import OrderedDict
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -109,6 +110,10 @@ class DemonstrationTable(nn.Module):
                 self._parts.popitem(last=False)
         self._parts.move_to_end(key)
         return part
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Copies and pickles have nothing kept: versions of tensors begin anew in them."""
+        return {**self.__dict__, "_parts": OrderedDict()}
 
     def select(self, view: View) -> DemonstrationTable:
         """The table of a view of the model: of its DoFs."""

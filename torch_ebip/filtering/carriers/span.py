@@ -65,6 +65,8 @@ class SpanCarrier(Carrier):
         assert part.moving is not None
         self._whole, self._model, self._generator = model, part, generator
         self._update = update.select(view)
+        if self._update.weighting is not None:
+            self._update.weighting.at_work()
         self._slots, self._depends_on_state = self._update.slots, part.noise_depends_on_state
         self._process, self._measurement = part.process_noise, part.measurement
         self._sensors = {dof: row for row, dof in enumerate(view.dofs.tolist())}

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -115,13 +114,9 @@ class Update(nn.Module):
             setattr(part, name, None if slot is None else slot.select(view))
         return part
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        super().__setattr__(name, value)
-        self.__dict__.pop("slots", None)
-
-    @cached_property
+    @property
     def slots(self) -> Slots:
-        """The parts by their places; found once, until another is put in."""
+        """The parts by their places."""
         return Slots(self.rule, tuple(self.trust), self.weighting, self.localisation, self.inflation)  # type: ignore
 
     def forward(self, carrier: Carrier, measured: Measured, perturbations: Tensor | None) -> Tensor:

@@ -47,6 +47,9 @@ class Seen(NamedTuple):
 class Weighting(Part, ABC):
     """Weighs members by what they, or the states they started as, make of what is seen."""
 
+    def at_work(self) -> None:
+        """Called of a part that one carrier has for itself: what parameters alone decide may be kept from now on."""
+
     @abstractmethod
     def start(self, origin: Tensor) -> Any:
         """A `WeightMemory` of members that have seen nothing and started as ``origin``, int64 [..., E]."""
