@@ -305,7 +305,7 @@ def test_more_that_is_refused_by_name() -> None:
     live.update([0.0] * 5, [True, False, True, False, False])
     made = ebip(PRIMITIVE)
     model = made.model
-    with pytest.raises(ValueError, match="the measurement noise, a MeasurementNoise, is of 5 DoFs, the model has 2"):
+    with pytest.raises(ValueError, match=r"a MeasurementNoise, is of \[5\] DoFs, the model has 2"):
         StateSpace(model.dynamics, model.measurement, None, model.measurement_noise, ("a", "b"), 0.1)
     with pytest.raises(ValueError, match="leaves no function beside the offset"):
         GaussianBasis(1, offset=True)

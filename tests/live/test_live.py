@@ -422,3 +422,14 @@ def test_a_live_filter_notices_assigned_parameters() -> None:
         state = filter.predict(state, filter.dt, generator)
         _, expected = filter.update(state, y[0, 1], observed[0, 1], generator)
     torch.testing.assert_close(live.update(y[0, 1], observed[0, 1]), expected)
+
+
+def test_a_copy_of_a_live_filter_is_its_own() -> None:
+    live = LiveFilter(ebip(small_primitive(torch.float64)), HUMAN, generator=torch.Generator().manual_seed(0))
+    y, observed = sequences()
+    live.update(y[0, 0], observed[0, 0])
+    other, before = copy.deepcopy(live), live.state.members
+    run(other, y[0], observed[0])
+    assert torch.equal(live.state.members, before)
+    twin = copy.deepcopy(live)
+    torch.testing.assert_close(run(twin, y[0], observed[0]), run(live, y[0], observed[0]))

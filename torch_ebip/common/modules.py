@@ -31,9 +31,14 @@ class FastTwins:
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
+
+        def depth(name: str) -> int:
+            """How far up the inheritance a name is defined, mixins included."""
+            return next((i for i, each in enumerate(cls.__mro__) if name in vars(each)), len(cls.__mro__))
+
         for plain, twins in cls.twins.items():
             for twin in twins:
-                if plain in vars(cls) and twin not in vars(cls):
+                if depth(plain) < depth(twin):
                     setattr(cls, twin, None)
 
 

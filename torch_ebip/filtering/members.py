@@ -18,8 +18,6 @@ from torch_ebip.filtering.states import State
 class NumbersItsStates(Protocol):
     """A prior whose members start as states of its own."""
 
-    states: Tensor
-
     def start(
         self, batch_shape: tuple[int, ...], n_members: int, chosen: Tensor | None, generator: Generators
     ) -> tuple[Tensor, Tensor]:

@@ -84,12 +84,7 @@ class StateSpace(nn.Module):
         self.stride = 1
         if not self.noise_depends_on_state:
             with torch.no_grad():
-                width = self.deviation(None).shape[-1]
-            if width != self.n_dofs:
-                raise ValueError(
-                    f"the measurement noise, a {type(measurement_noise).__name__}, is of {width} DoFs, "
-                    f"the model has {self.n_dofs}"
-                )
+                self.deviation(None)
 
     def __setattr__(self, name: str, value: Any) -> None:
         super().__setattr__(name, value)
@@ -176,7 +171,11 @@ class StateSpace(nn.Module):
         Args:
             moving: [..., m], mean of what moves; None where R does not depend on the state.
         """
-        return self.measurement_noise(moving)  # type: ignore[no-any-return]
+        deviation: Tensor = self.measurement_noise(moving)
+        if deviation.shape[-1:] != (self.n_dofs,):
+            noise, width = type(self.measurement_noise).__name__, list(deviation.shape[-1:])
+            raise ValueError(f"the measurement noise, a {noise}, is of {width} DoFs, the model has {self.n_dofs}")
+        return deviation
 
     def view(self, dofs: Tensor, stride: int = 1) -> View:
         """What of the model some DoFs, bool [D], need.

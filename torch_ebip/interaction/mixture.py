@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch_ebip.common.ambient import owned
 from torch_ebip.common.arguments import as_count
 from torch_ebip.common.draws import Generators, standard_normal, uniform
+from torch_ebip.common.modules import sharing
 from torch_ebip.filtering.protocols import View
 from torch_ebip.interaction.priors import check_members, check_states
 
@@ -91,7 +92,9 @@ class MixturePrior(nn.Module):
 
     def select(self, view: View) -> MixturePrior:
         """The prior of a view of the model."""
-        return MixturePrior(self.states[:, view.state], self.responsibilities, self.moving)
+        part = sharing(self)
+        part.register_buffer("states", self.states[:, view.state])
+        return part
 
 
 def fit_responsibilities(weights: Tensor, max_components: int, seed: int) -> Tensor:

@@ -98,7 +98,10 @@ class InteractionNoise(FastTwins, nn.Module):
         moving: m.
     """
 
-    twins: ClassVar[dict[str, tuple[str, ...]]] = {"forward": ("add_", "factor", "add_covariance_")}
+    twins: ClassVar[dict[str, tuple[str, ...]]] = {
+        "forward": ("add_", "factor", "add_covariance_"),
+        "add_": ("factor", "add_covariance_"),
+    }
     columns: Tensor | None
 
     def __init__(self, phase: nn.Module, weights: WeightNoise | None = None, moving: int = 2) -> None:
@@ -129,6 +132,9 @@ class InteractionNoise(FastTwins, nn.Module):
 
     def factor(self, dt: Tensor) -> Tensor:
         """Lower factor [..., m, m] of the covariance of what moves for steps dt [...] seconds."""
+        return self._factor(dt)
+
+    def _factor(self, dt: Tensor) -> Tensor:
         return self.phase.cholesky(dt, self.stride)  # type: ignore[operator, no-any-return]
 
     def covariance(self, dt: Tensor) -> tuple[Tensor, Tensor | None]:
@@ -138,7 +144,7 @@ class InteractionNoise(FastTwins, nn.Module):
             The covariance of what moves, [..., m, m], and the variances of the other entries, [..., n_weights]; None
             where they have no noise.
         """
-        factor, weights = self.factor(dt), self._weight_scale(dt)
+        factor, weights = self._factor(dt), self._weight_scale(dt)
         return factor @ factor.transpose(-1, -2), None if weights is None else weights.square()
 
     def add_covariance_(self, covariance: Tensor, dt: Tensor) -> Tensor:
@@ -166,12 +172,15 @@ class InteractionNoise(FastTwins, nn.Module):
         Returns:
             [..., E, n].
         """
-        return self.add_(members.clone(), dt, generator)
+        return self._add(members.clone(), dt, generator)
 
     def add_(self, members: Tensor, dt: Tensor, generator: Generators = None) -> Tensor:
         """The same in place, for members that nobody else holds: see `InteractionNoise.forward`."""
+        return self._add(members, dt, generator)
+
+    def _add(self, members: Tensor, dt: Tensor, generator: Generators) -> Tensor:
         m = self.leading
-        factor = self.factor(dt).transpose(-1, -2)
+        factor = self._factor(dt).transpose(-1, -2)
         members[..., :m] += standard_normal(members[..., :m].shape, members, generator) @ factor
         scale = self._weight_scale(dt)
         if scale is not None:

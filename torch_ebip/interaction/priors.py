@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor, nn
 
 from torch_ebip.common.ambient import owned
 from torch_ebip.common.arguments import as_number
 from torch_ebip.common.draws import Generators, integers
+from torch_ebip.common.modules import FastTwins, sharing
 from torch_ebip.filtering.protocols import View
 
 
-class DemonstrationPrior(nn.Module):
+class DemonstrationPrior(FastTwins, nn.Module):
     """The demonstrations themselves: the paper's eBIP, step 1 of its algorithm.
 
     Args:
         states: [N, n], one state a demonstration: phase 0, its phase velocity, its weights.
     """
 
+    twins: ClassVar[dict[str, tuple[str, ...]]] = {"forward": ("start",)}
     states: Tensor
 
     def __init__(self, states: Tensor) -> None:
@@ -40,7 +44,7 @@ class DemonstrationPrior(nn.Module):
             chosen: int64 [..., E].
             generator: of the draws.
         """
-        return self.start(batch_shape, n_members, chosen, generator)[0]
+        return self._started(batch_shape, n_members, chosen, generator)[0]
 
     def start(
         self, batch_shape: tuple[int, ...], n_members: int, chosen: Tensor | None, generator: Generators
@@ -57,6 +61,11 @@ class DemonstrationPrior(nn.Module):
         Raises:
             ValueError: an index of a demonstration that there is not, or shapes that do not broadcast.
         """
+        return self._started(batch_shape, n_members, chosen, generator)
+
+    def _started(
+        self, batch_shape: tuple[int, ...], n_members: int, chosen: Tensor | None, generator: Generators
+    ) -> tuple[Tensor, Tensor]:
         count = len(self.states)
         if chosen is None:
             if n_members == count:
@@ -69,7 +78,9 @@ class DemonstrationPrior(nn.Module):
 
     def select(self, view: View) -> DemonstrationPrior:
         """The prior of a view of the model."""
-        return DemonstrationPrior(self.states[:, view.state])
+        part = sharing(self)
+        part.register_buffer("states", self.states[:, view.state])
+        return part
 
 
 class MomentPrior(nn.Module):
@@ -136,7 +147,9 @@ class MomentPrior(nn.Module):
 
     def select(self, view: View) -> MomentPrior:
         """The prior of a view of the model."""
-        return MomentPrior(self.states[:, view.state], self.shrinkage, self.moving)
+        part = sharing(self)
+        part.register_buffer("states", self.states[:, view.state])
+        return part
 
 
 def check_states(states: Tensor) -> None:

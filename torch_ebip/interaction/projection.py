@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_ebip.common.brief import brief
-from torch_ebip.common.modules import FastTwins
+from torch_ebip.common.modules import FastTwins, sharing
 from torch_ebip.filtering.carriers.columns import ColumnMembers
 from torch_ebip.filtering.protocols import View
 from torch_ebip.interaction.basis.stacked import StackedBasis
@@ -23,7 +23,10 @@ class BasisProjection(FastTwins, nn.Module):
         moving: m, how many entries of a state come before the weights, the phase first.
     """
 
-    twins: ClassVar[dict[str, tuple[str, ...]]] = {"forward": ("rows", "projector", "jacobian")}
+    twins: ClassVar[dict[str, tuple[str, ...]]] = {
+        "forward": ("rows", "projector", "jacobian"),
+        "rows": ("projector", "jacobian"),
+    }
 
     def __init__(self, basis: StackedBasis, moving: int = 2) -> None:
         super().__init__()
@@ -33,7 +36,7 @@ class BasisProjection(FastTwins, nn.Module):
     def forward(self, members: Tensor) -> Tensor:
         """Projections [..., E, D] of members [..., E, n]."""
         moving, still = torch.split(members, [self.moving, members.shape[-1] - self.moving], dim=-1)
-        return self.rows(moving, still, None)
+        return self._rows(moving, still, None, None)
 
     def rows(self, moving: Tensor, still: Tensor, dofs: Sequence[int] | None, centre: Tensor | None = None) -> Tensor:
         """Projections [..., E, k] of members, of some dofs.
@@ -44,6 +47,9 @@ class BasisProjection(FastTwins, nn.Module):
             dofs: ascending indices; None for all.
             centre: [..., n_weights], to which the weights are deviations; default: they are none.
         """
+        return self._rows(moving, still, dofs, centre)
+
+    def _rows(self, moving: Tensor, still: Tensor, dofs: Sequence[int] | None, centre: Tensor | None) -> Tensor:
         return self.basis.project(moving[..., 0], still, dofs, centre)
 
     def at(self, members: Tensor, phase: Tensor) -> Tensor:
@@ -58,7 +64,9 @@ class BasisProjection(FastTwins, nn.Module):
         """The same for a view of the model."""
         dofs = torch.zeros(self.basis.n_dofs, dtype=torch.bool, device="cpu")
         dofs[view.dofs.cpu()] = True
-        return BasisProjection(self.basis.select(dofs), self.moving)
+        part = sharing(self)
+        part.basis = self.basis.select(dofs)
+        return part
 
     def jacobian(self, mean: Tensor) -> Callable[[Tensor], Tensor]:
         """The product with H', [..., k, n] -> [..., k, D], at a mean [..., n]: the paper's equation of H_t.

@@ -51,6 +51,8 @@ def why_not_span(model: StateSpace, update: Update) -> str | None:
     """Why a `SpanCarrier` cannot serve a model and an update; None if it can."""
     if model.leaves_span is not None or update.leaves_span is not None:
         return model.leaves_span or update.leaves_span
+    if update.rule.columns is None:
+        return f"a {type(update.rule).__name__} has no twin for columns"
     if model.moving is None:
         return "the model does not say that a part of its state stands still"
     for part, protocol, what in (

@@ -7,12 +7,13 @@ as columns, results into buffers. Tests hold the two equal.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torch_ebip.common.brief import brief
+from torch_ebip.common.modules import FastTwins
 from torch_ebip.filtering import functional
 from torch_ebip.filtering.functional import Innovation
 from torch_ebip.filtering.updates.part import Part
@@ -45,9 +46,10 @@ class Columns(NamedTuple):
         return brief(self)
 
 
-class Rule(Part, ABC):
+class Rule(FastTwins, Part, ABC):
     """How an innovation moves the members."""
 
+    twins: ClassVar[dict[str, tuple[str, ...]]] = {"forward": ("columns",)}
     perturbs = False
     """Whether it needs draws, one for each member and DoF."""
 

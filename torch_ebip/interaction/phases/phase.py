@@ -32,7 +32,10 @@ class PhaseModel(FastTwins, nn.Module, ABC):
         overrun: how far beyond the interval a phase can get.
     """
 
-    twins: ClassVar[dict[str, tuple[str, ...]]] = {"forward": ("advancer", "moved_covariance", "makes_new_members")}
+    twins: ClassVar[dict[str, tuple[str, ...]]] = {
+        "forward": ("advancer", "moved_covariance", "makes_new_members"),
+        "hold": ("advancer", "moved_covariance"),
+    }
     makes_new_members: ClassVar[bool] = True
     """Its result is never its argument, so that noise can be added in place."""
 
@@ -73,18 +76,7 @@ class PhaseModel(FastTwins, nn.Module, ABC):
         Returns:
             A function of dt in seconds.
         """
-        phase, by_member = moving.select(-2, 0), moving.transpose(-1, -2)
-        velocity = self.velocity(by_member)
-        follows = velocity._is_view() and velocity._base is by_member._base  # a view changes with its base
-
-        def advance(dt: float) -> None:
-            """Advance by dt seconds."""
-            phase.add_(velocity if follows else self.velocity(by_member), alpha=dt)
-            low, high = torch.aminmax(phase)
-            if float(low) < 0 or float(high) > 1:
-                phase.copy_(self.hold(phase))
-
-        return advance
+        return _Advance(self, moving)
 
     def hold(self, phase: Tensor) -> Tensor:
         """Phases [...] with what lies beyond the interval drawn in: e becomes e overrun / (overrun + |e|)."""
@@ -127,3 +119,21 @@ class PhaseModel(FastTwins, nn.Module, ABC):
     def extra_repr(self) -> str:
         """How far a phase can get."""
         return f"overrun={self.overrun:g}"
+
+
+class _Advance:
+    """Advances members that are columns, [..., m, E]. An object, so that copies of it advance copies of them."""
+
+    def __init__(self, model: PhaseModel, moving: Tensor) -> None:
+        self._model, self._by_member, self._phase = model, moving.transpose(-1, -2), moving.select(-2, 0)
+        velocity = model.velocity(self._by_member)
+        view = velocity._is_view() and velocity._base is self._by_member._base
+        self._velocity = velocity if view else None  # a view changes with its base
+
+    def __call__(self, dt: float) -> None:
+        """Advance by dt seconds."""
+        phase, velocity = self._phase, self._velocity
+        phase.add_(self._model.velocity(self._by_member) if velocity is None else velocity, alpha=dt)
+        low, high = torch.aminmax(phase)
+        if float(low) < 0 or float(high) > 1:
+            phase.copy_(self._model.hold(phase))
