@@ -142,9 +142,11 @@ def test_how_a_filter_runs_is_no_meaning() -> None:
 
 def test_a_state_dict_from_before_loads_with_a_warning() -> None:
     made = ebip(primitive())
-    old = {name: value for name, value in made.state_dict().items() if "_extra_state" not in name}
+    old = {name: value.clone() for name, value in made.state_dict().items() if "_extra_state" not in name}
+    old["model.measurement_noise.variance.raw"] += 0.5
     with pytest.warns(UserWarning, match="does not say what its InteractionEnsembleFilter means"):
         made.load_state_dict(old)
+    assert (made.model.measurement_noise.variance.raw == 0.5).all()
 
 
 @pytest.mark.parametrize("damage", [torch.zeros(3, dtype=torch.uint8), torch.ones(2), "text", None])

@@ -119,10 +119,6 @@ class Update(nn.Module):
         """The parts by their places."""
         return Slots(self.rule, tuple(self.trust), self.weighting, self.localisation, self.inflation)  # type: ignore
 
-    def forward(self, carrier: Carrier, measured: Measured, perturbations: Tensor | None) -> Tensor:
-        """See `analyse`, which is what a carrier, its measured values and perturbations [..., E, K] are given to."""
-        return analyse(self.slots, carrier, measured, perturbations)
-
 
 def analyse(slots: Slots, carrier: Carrier, measured: Measured, perturbations: Tensor | None) -> Tensor:
     """x = x + K (y + eps - h(x)), and what is learned beside it: the one place where the parts are put in order.
