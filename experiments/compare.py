@@ -25,9 +25,9 @@ from experiments.figures import results_figure
 from experiments.folds import LOST, mean_of_cells, read_values, run_folds, share_cores, split, write_values
 from experiments.paper_table import paper_rows
 from experiments.results import Values, markdown, print_tables, summarise
-from experiments.run_folder import RunFolder, read_json, save_figure, write_json
+from experiments.run_folder import RunFolder, save_figure
 from torch_ebip import TuningSettings
-from torch_ebip.common.files import atomic_write
+from torch_ebip.common.files import atomic_write, read_json, write_json
 from torch_ebip.learning.ranks import RankLostError, Ranks
 
 

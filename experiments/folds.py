@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from experiments.interrupts import deaf_children, end_children
 from experiments.results import Cell, Values
-from experiments.run_folder import read_json, write_json
+from torch_ebip.common.files import read_json, write_json
 from torch_ebip.learning.ranks import Ranks
 
 Job = TypeVar("Job")

@@ -28,8 +28,9 @@ from tqdm import tqdm
 
 from experiments.command_line import add_run_options, command, experiment_parser
 from experiments.rerun import compare
-from experiments.run_folder import RunFolder, read_json
+from experiments.run_folder import RunFolder
 from torch_ebip import Demonstrations, Layout, Modality
+from torch_ebip.common.files import read_json
 
 LAYOUT = Layout(
     [

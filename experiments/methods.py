@@ -11,7 +11,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from experiments.run_folder import read_json, write_json
 from torch_ebip import (
     AboveOne,
     BSplineBasis,
@@ -28,6 +27,7 @@ from torch_ebip import (
     ebip,
     particle_filter,
 )
+from torch_ebip.common.files import read_json, write_json
 from torch_ebip.learning.checkpoint import load_checkpoint, save_checkpoint
 from torch_ebip.learning.losses import ForwardKinematicsLoss
 from torch_ebip.learning.monitor import Monitor

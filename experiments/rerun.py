@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.command_line import command, experiment_parser
-from experiments.run_folder import read_json
+from torch_ebip.common.files import read_json
 
 MEASURED = re.compile(r"seconds|_per_second|_over_|megabytes|gigabytes|exponent|time_relative|^run$")
 """Names of what a clock or the machine says, and of the run itself."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import platform
 import secrets
@@ -20,13 +19,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from experiments.interrupts import advise
-from torch_ebip.common.files import atomic_write, read_text
+from torch_ebip.common.files import atomic_write, read_json, write_json
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-LARGEST_JSON = 1 << 28
-"""Bytes."""
 
 
 class RunFolder:
@@ -125,34 +121,6 @@ class RunFolder:
     def results(self) -> Path:
         """``results.json``, there once the run is finished."""
         return self.path / "results.json"
-
-
-def read_json(path: Path) -> Any:
-    """What `write_json` wrote.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is no JSON, or cannot be read.
-    """
-    text = read_text(path, LARGEST_JSON)
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: not what a run writes, or damaged: {error}") from error
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write JSON atomically; numbers that are not finite become null."""
-    with atomic_write(path) as file:
-        file.write((json.dumps(_finite(content), indent=1, allow_nan=False) + "\n").encode())
-
-
-def _finite(content: Any) -> Any:
-    if isinstance(content, dict):
-        return {key: _finite(value) for key, value in content.items()}
-    if isinstance(content, list | tuple):
-        return [_finite(value) for value in content]
-    return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
 def save_figure(figure: Figure, path: Path) -> None:

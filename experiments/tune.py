@@ -36,9 +36,9 @@ from experiments.folds import (
 )
 from experiments.methods import FACTORS, Problem, best_factor, best_start, keep, scaled, tunable, tune
 from experiments.results import Values, print_tables, summarise
-from experiments.run_folder import RunFolder, read_json, save_figure, write_json
+from experiments.run_folder import RunFolder, save_figure
 from torch_ebip import InteractionPrimitive, TuningSettings, select_basis
-from torch_ebip.common.files import atomic_write
+from torch_ebip.common.files import atomic_write, read_json, write_json
 from torch_ebip.interaction.basis import rank_candidates, selection_table
 from torch_ebip.learning.monitor import Monitor
 from torch_ebip.learning.ranks import RankLostError, Ranks

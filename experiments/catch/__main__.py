@@ -23,8 +23,8 @@ from experiments.catch.learning import learn
 from experiments.catch.table import markdown, print_table, summarise
 from experiments.catch.throws import LATENCY
 from experiments.command_line import add_run_options, command, experiment_parser
-from experiments.run_folder import RunFolder, read_json
-from torch_ebip.common.files import atomic_write
+from experiments.run_folder import RunFolder
+from torch_ebip.common.files import atomic_write, read_json
 
 GROUPS = {"imu": ("imu_acceleration", "imu_gyro"), "shoes": ("shoe_left", "shoe_right")}
 """Names of sensors that are one object, beside the single ones."""

@@ -25,8 +25,8 @@ from experiments.catch.learning import filters, know
 from experiments.catch.throws import CONDITIONS, Toss, draw
 from experiments.catch.trial import Drop, Outcome, run
 from experiments.folds import in_processes
-from experiments.run_folder import read_json, write_json
 from torch_ebip import Filter, InteractionPrimitive
+from torch_ebip.common.files import read_json, write_json
 
 METHODS = ("ebip_tuned", "ebip_tuned_all", "ebip_scaled", "ebip", "particle_filter", "mean", "reactive")
 PORTION = 20

@@ -19,8 +19,8 @@ import torch
 
 from experiments.folds import write_values
 from experiments.results import Cell
-from experiments.run_folder import write_json
 from torch_ebip import Filter, InteractionPrimitive, InteractionSession, SessionSettings
+from torch_ebip.common.files import write_json
 from torch_ebip.learning.checkpoint import save_checkpoint
 
 Generator = Callable[[Random, Path, bool], None]

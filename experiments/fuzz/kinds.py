@@ -22,7 +22,6 @@ from experiments.fuzz.mutations import Mutation
 from experiments.fuzz.worker import Reader
 from experiments.methods import Start, keep, restore, tunable
 from experiments.results import Cell
-from experiments.run_folder import write_json
 from torch_ebip import (
     BSplineBasis,
     Demonstrations,
@@ -35,6 +34,7 @@ from torch_ebip import (
     ebip,
     replay,
 )
+from torch_ebip.common.files import write_json
 from torch_ebip.learning.checkpoint import load_checkpoint, save_checkpoint
 
 CONFIGURATION = {"seed": 1, "horizons": [0.2, 0.9], "start": {"factor": 10.0}}

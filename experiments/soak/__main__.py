@@ -26,11 +26,12 @@ from experiments import figures  # chooses a backend without a screen
 from experiments.command_line import add_run_options, command, experiment_parser
 from experiments.data import load
 from experiments.folds import split
-from experiments.run_folder import RunFolder, read_json, save_figure, write_json
+from experiments.run_folder import RunFolder, save_figure
 from experiments.soak.stream import Sample, stream
 from experiments.soak.subjects import DEFAULT, SHARES, SUBJECTS, Subject
 from experiments.soak.watch import Window, relative_time, verdict, watch
 from torch_ebip import BSplineBasis, InteractionPrimitive, StackedBasis
+from torch_ebip.common.files import read_json, write_json
 
 WINDOWS = 100
 LEAST = 100

@@ -22,7 +22,7 @@ from experiments.catch.table import markdown, summarise
 from experiments.catch.throws import Toss, catchable, draw
 from experiments.catch.trial import Drop, run
 from experiments.methods import Start, keep, tunable
-from experiments.run_folder import write_json
+from torch_ebip.common.files import write_json
 
 pytest.importorskip("mujoco")
 READY = np.array(HABITS[0].ready)

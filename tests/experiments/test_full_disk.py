@@ -9,7 +9,7 @@ import pytest
 
 from experiments.kill import damage, recording
 from experiments.rerun import compare
-from experiments.run_folder import read_json
+from torch_ebip.common.files import read_json
 
 # As root of a user namespace one may mount a small disk: start on it, look, make it larger, go on.
 SCRIPT = """

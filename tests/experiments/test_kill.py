@@ -12,7 +12,8 @@ import pytest
 import torch
 
 from experiments.kill import damage, main, stage, strangers
-from experiments.run_folder import RunFolder, write_json
+from experiments.run_folder import RunFolder
+from torch_ebip.common.files import write_json
 from torch_ebip.learning.checkpoint import save_checkpoint
 
 

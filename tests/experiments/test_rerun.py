@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from experiments.rerun import compare, main
-from experiments.run_folder import read_json, write_json
+from torch_ebip.common.files import read_json, write_json
 
 THREADS_TOLERANCE = 1e-4
 """Relative; sums are made in another order. Measured: 8e-6 for `experiments.tune --quick` on 40 demonstrations."""

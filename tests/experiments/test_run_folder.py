@@ -4,7 +4,8 @@ from pathlib import Path
 import pytest
 
 from experiments.folds import read_values
-from experiments.run_folder import RunFolder, read_json, write_json
+from experiments.run_folder import RunFolder
+from torch_ebip.common.files import read_json, write_json
 
 
 def test_a_new_run_says_everything_needed(tmp_path: Path) -> None:

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import io
+import json
+import math
 import os
 import secrets
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
+
+LARGEST_JSON = 1 << 28
+"""Bytes."""
 
 
 def open_file(path: str | os.PathLike[str], limit: int | None) -> IO[bytes]:
@@ -82,3 +87,32 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
         if isinstance(error, OSError) and error.filename in (None, str(temporary)):
             error.filename = str(target)  # a full disk does not say which file it refused
         raise
+
+
+def read_json(path: str | os.PathLike[str]) -> Any:
+    """What `write_json` wrote at a path.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no JSON, or cannot be read.
+    """
+    text = read_text(path, LARGEST_JSON)
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: not what a run writes, or damaged: {error}") from error
+
+
+def write_json(path: str | os.PathLike[str], content: Any) -> None:
+    """Write content as JSON to a path, atomically; numbers that are not finite become null."""
+    with atomic_write(path) as file:
+        file.write((json.dumps(finite(content), indent=1, allow_nan=False) + "\n").encode())
+
+
+def finite(content: Any) -> Any:
+    """Content that JSON can say: dictionaries, lists and plain values, None where a number is not finite."""
+    if isinstance(content, dict):
+        return {key: finite(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [finite(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
