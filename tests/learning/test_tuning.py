@@ -265,8 +265,8 @@ def test_the_tool_counts_through_the_arm() -> None:
 def test_bad_settings_are_named() -> None:
     with pytest.raises(ValueError, match="no parameter matches"):
         filter_and_tuner(TuningSettings(only=("nothing",)))
-    with pytest.raises(ValueError, match="too few for 13 folds"):
-        filter_and_tuner(TuningSettings(folds=13))
+    with pytest.raises(ValueError, match="too few for 25 folds"):
+        filter_and_tuner(TuningSettings(folds=25))
     primitive = small_primitive()
     objective = ForecastObjective(primitive, TARGETS)
     with pytest.raises(ValueError, match="horizons must be"):

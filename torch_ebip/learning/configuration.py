@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
+from torch_ebip.common.arguments import as_mask
 from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.primitive import InteractionPrimitive
+from torch_ebip.learning.objective import ForecastObjective
 from torch_ebip.recordings.demonstrations import Demonstrations
 
 if TYPE_CHECKING:
@@ -28,6 +30,61 @@ def check_parts(filter: InteractionFilter, demonstrations: Demonstrations, primi
     states = getattr(filter.prior, "states", None)
     if states is None or not torch.equal(states[:, filter.phase_model.moving :], primitive.weights):
         raise ValueError("the filter's prior does not hold the demonstrations of this primitive")
+
+
+class Task(NamedTuple):
+    """What is tuned for.
+
+    Attributes:
+        primitive: of the demonstrations.
+        objective: what is minimised.
+        targets: bool [D], the DoFs to forecast.
+        subsets: bool [D] of the sensors that may be shown together, by name.
+    """
+
+    primitive: InteractionPrimitive
+    objective: ForecastObjective
+    targets: Tensor
+    subsets: Mapping[str, Tensor]
+
+
+def complete(
+    filter: InteractionFilter,
+    demonstrations: Demonstrations,
+    primitive: InteractionPrimitive | None,
+    objective: ForecastObjective | None,
+    targets: Tensor | None,
+    subsets: Mapping[str, Tensor] | None,
+) -> Task:
+    """What a caller left out, from what they gave; see `Tuner`.
+
+    Raises:
+        ValueError: parts that do not belong together.
+    """
+    if primitive is None:
+        basis, states = filter.basis_projection.basis, getattr(filter.prior, "states", None)
+        if states is not None:
+            moved = demonstrations.to(dtype=states.dtype, device=states.device)
+            primitive = InteractionPrimitive.fit(moved, basis).to(states)
+        else:
+            primitive = InteractionPrimitive.fit(demonstrations, basis)
+    check_parts(filter, demonstrations, primitive)
+    layout, device = primitive.layout, primitive.weights.device
+    if targets is None:
+        targets = layout.controlled if objective is None else layout.mask(objective.names)
+    targets = as_mask("targets", targets, layout.n_dofs).to(device)
+    if objective is None:
+        objective = ForecastObjective(primitive, targets).to(device)
+    if targets.tolist() != [dof in objective.names for dof in layout.dofs]:
+        raise ValueError(f"the objective scores {', '.join(objective.names)}, which are not the targets")
+    if subsets is None:
+        subsets = {"all": ~targets.cpu()}
+        if not bool(subsets["all"].any()):
+            raise ValueError("every DoF is a target: say in `subsets` which of them sensors show")
+    if not subsets:
+        raise ValueError("subsets must be at least one set of sensors that are shown together")
+    masks = {name: as_mask(f"subset {name!r}", subset, layout.n_dofs).to(device) for name, subset in subsets.items()}
+    return Task(primitive, objective, targets, masks)
 
 
 def configuration(tuner: Tuner) -> dict[str, Any]:

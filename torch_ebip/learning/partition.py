@@ -19,20 +19,22 @@ class Partition:
         training, validating: int64, which demonstrations.
 
     Raises:
-        ValueError: fewer than two folds, or too few demonstrations for them.
+        ValueError: fewer than two folds, or too few demonstrations for them: every fold needs one, and an ensemble of
+            the others at least two members.
     """
 
     def __init__(self, count: int, settings: TuningSettings) -> None:
         held = max(1, round(settings.validation * count))
-        if settings.folds < 2 or count - held < 1 or count < 2 * settings.folds:
+        others = count - -(-count // settings.folds)
+        if count - held < 1 or count < settings.folds or others < 2:
             raise ValueError(f"{count} demonstrations are too few for {settings.folds} folds and validation")
         order = torch.randperm(count, generator=torch.Generator("cpu").manual_seed(settings.seed), device="cpu")
         self.validating, self.training = order[:held], order[held:]
         part = torch.empty(count, dtype=torch.long, device="cpu")
         part[order] = torch.arange(count, device="cpu") % settings.folds
-        others = [(part != fold).nonzero().squeeze(-1) for fold in range(settings.folds)]
-        size = min(len(group) for group in others)
-        self._part, self._others = part, torch.stack([group[:size] for group in others])
+        groups = [(part != fold).nonzero().squeeze(-1) for fold in range(settings.folds)]
+        size = min(len(group) for group in groups)
+        self._part, self._others = part, torch.stack([group[:size] for group in groups])
         self._size = settings.n_members
 
     def members(self, interactions: Tensor, generator: torch.Generator) -> Tensor:

@@ -19,19 +19,21 @@ import torch
 from torch import Tensor, nn
 
 from torch_ebip.common.ambient import own_modes, without_autocast
-from torch_ebip.common.arguments import as_mask
 from torch_ebip.common.draws import seeded
 from torch_ebip.filtering.trace import Trace
 from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.learning.checkpoint import load_checkpoint, save_checkpoint
-from torch_ebip.learning.configuration import check_parts, configuration
+from torch_ebip.learning.configuration import complete, configuration
 from torch_ebip.learning.monitor import Monitor
 from torch_ebip.learning.objective import ForecastObjective
 from torch_ebip.learning.partition import Partition, generator_of
 from torch_ebip.learning.ranks import Ranks
 from torch_ebip.learning.settings import TuningResult, TuningSettings
 from torch_ebip.recordings.demonstrations import Demonstrations
+
+PORTION = 64
+"""Interactions that are filtered at once where none needs a gradient: more would only take memory."""
 
 
 class Tuner:
@@ -40,10 +42,11 @@ class Tuner:
     Args:
         filter: made by `ebip`, `bip` and the like, changed in place; its prior's states are those of ``primitive``.
         demonstrations: N of them, what ``primitive`` was fitted to.
-        primitive: for the targets.
-        objective: what is minimised.
-        targets: bool [D], the DoFs to forecast, the same that the objective knows.
-        subsets: the sensors that may be shown together, bool [D] each, by name; one is drawn for each step.
+        primitive: of those demonstrations; default: fitted to them, on the filter's basis.
+        objective: what is minimised; default: a `ForecastObjective` of the targets.
+        targets: bool [D], the DoFs to forecast; default: those that the objective knows, or that are controlled.
+        subsets: the sensors that may be shown together, bool [D] each, by name; one is drawn for each step;
+            default: all that are no targets.
         settings: how.
         monitor: where to report; default: nowhere.
         checkpoint: path of a file to continue from if it exists, and to write after each validation.
@@ -63,29 +66,21 @@ class Tuner:
         self,
         filter: InteractionFilter,
         demonstrations: Demonstrations,
-        primitive: InteractionPrimitive,
-        objective: ForecastObjective,
-        targets: Tensor,
-        subsets: Mapping[str, Tensor],
+        primitive: InteractionPrimitive | None = None,
+        objective: ForecastObjective | None = None,
+        targets: Tensor | None = None,
+        subsets: Mapping[str, Tensor] | None = None,
         settings: TuningSettings | None = None,
         monitor: Monitor | None = None,
         checkpoint: str | os.PathLike[str] | None = None,
         progress: Callable[[int, float, float], None] | None = None,
         ranks: Ranks | None = None,
     ) -> None:
-        check_parts(filter, demonstrations, primitive)
-        self.filter, self.primitive, self.objective = filter, primitive, objective
+        self.filter = filter
+        task = complete(filter, demonstrations, primitive, objective, targets, subsets)
+        self.primitive, self.objective, self.targets, self.subsets = task
         self.settings = TuningSettings() if settings is None else settings
-        device = primitive.weights.device
-        self.targets = as_mask("targets", targets, primitive.layout.n_dofs).to(device)
-        if self.targets.tolist() != [dof in objective.names for dof in primitive.layout.dofs]:
-            raise ValueError(f"the objective scores {', '.join(objective.names)}, which are not the targets")
-        if not subsets:
-            raise ValueError("subsets must be at least one set of sensors that are shown together")
-        self.subsets = {
-            name: as_mask(f"subset {name!r}", subset, primitive.layout.n_dofs).to(device)
-            for name, subset in subsets.items()
-        }
+        device = self.primitive.weights.device
         self.monitor, self.progress = monitor, progress
         self.ranks = Ranks() if ranks is None else ranks
         self.checkpoint = None if checkpoint is None else Path(checkpoint)
@@ -230,29 +225,36 @@ class Tuner:
         if self.ranks.size > len(interactions):
             raise ValueError(f"{self.ranks.size} processes, but only {len(interactions)} interactions to share")
         totals: dict[str, list[float]] = {}
+        members = self.partition.members(interactions, generator_of(self.settings.seed, -1))
+        portion = PORTION * self.ranks.size
         for name, subset in self.subsets.items():
-            members = self.partition.members(interactions, generator_of(self.settings.seed, -1))
-            every = shares.expand(len(interactions), -1)
-            part, trace, context = self._filter(interactions, subset, every, members, -1)
-            terms = {key: float(value) for key, value in self.objective(part, trace, *context).items()}
-            terms[f"subset/{name}"] = sum(terms.values())
-            squares = self.objective.spread_and_error(part, trace, context[1], context[3]).square()
-            terms["spread"], terms["error"] = squares.tolist()
-            for key, value in self.ranks.mean(terms, len(context[0])).items():
+            sums: dict[str, float] = {}
+            for some, theirs in zip(torch.split(interactions, portion), torch.split(members, portion), strict=True):
+                if len(some) <= self.ranks.rank:  # fewer are left than there are processes
+                    continue
+                part, trace, context = self._filter(some, subset, shares.expand(len(some), -1), theirs, -1)
+                terms = {key: float(value) for key, value in self.objective(part, trace, *context).items()}
+                terms[f"subset/{name}"] = sum(terms.values())
+                squares = self.objective.spread_and_error(part, trace, context[1], context[3]).square()
+                terms["spread"], terms["error"] = squares.tolist()
+                for key, value in terms.items():
+                    sums[key] = sums.get(key, 0.0) + value * len(context[0])
+            mine = len(self.ranks.shard(range(len(interactions))))
+            means = self.ranks.mean({key: value / mine for key, value in sums.items()}, mine)
+            for key, value in means.items():
                 totals.setdefault(key, []).append(value)
-        means = {key: sum(values) / len(values) for key, values in totals.items()}
-        spread, error = math.sqrt(means.pop("spread")), math.sqrt(means.pop("error"))
-        loss = sum(value for key, value in means.items() if not key.startswith("subset/"))
-        return {**means, "loss": loss, "spread": spread, "error": error}
+        overall = {key: sum(values) / len(values) for key, values in totals.items()}
+        spread, error = math.sqrt(overall.pop("spread")), math.sqrt(overall.pop("error"))
+        loss = sum(value for key, value in overall.items() if not key.startswith("subset/"))
+        return {**overall, "loss": loss, "spread": spread, "error": error}
 
     def _validate(self, step: int) -> float:
         scores = self.evaluate()
         if self.monitor is not None:
             spread, error = scores.pop("spread"), scores.pop("error")
-            scalars = {f"validation/{key}": value for key, value in scores.items()}
-            scalars |= {"calibration/spread": spread, "calibration/error": error}
-            scalars["calibration/spread_over_error"] = spread / error
-            self.monitor.scalars(scalars, step)
+            self.monitor.scalars({f"validation/{key}": value for key, value in scores.items()}, step)
+            calibration = {"spread": spread, "error": error, "spread_over_error": spread / error}
+            self.monitor.scalars({f"calibration/{key}": value for key, value in calibration.items()}, step)
             self.monitor.filter(self.filter, self.layout, step)
         return scores["loss"]
 

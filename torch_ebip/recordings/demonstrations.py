@@ -15,7 +15,7 @@ from torch_ebip.common.ambient import outside_inference, own_modes
 from torch_ebip.common.arguments import as_count, as_indices, as_number, as_values
 from torch_ebip.recordings.arrays import LIMIT, Array, Recordings, read_npz, write_npz
 from torch_ebip.recordings.folders import CSV_LIMIT, read_folder
-from torch_ebip.recordings.layout import Layout
+from torch_ebip.recordings.layout import Layout, Modality
 
 
 class Demonstrations:
@@ -28,10 +28,11 @@ class Demonstrations:
             that they carry is left behind.
         rate: samples a second, Hz.
         columns: further facts, one row a demonstration (release times, names), kept under their names.
+        labels: which interaction each demonstration shows, N names; kept as the column ``labels``.
 
     Raises:
         ValueError: no demonstration; a trajectory that is not [T >= 2, D], has no measured value or an
-            infinite one; a rate that is not a positive number; a column without N rows.
+            infinite one; a rate that is not a positive number; a column without N rows; labels that are not N names.
     """
 
     def __init__(
@@ -40,6 +41,7 @@ class Demonstrations:
         trajectories: Sequence[Tensor | npt.ArrayLike],
         rate: float,
         columns: Mapping[str, Array] | None = None,
+        labels: Sequence[str] | None = None,
     ) -> None:
         rate = as_number("rate", rate, 0, above=True, of="of samples a second")
         if len(trajectories) == 0:
@@ -50,6 +52,12 @@ class Demonstrations:
         if len({(trajectory.dtype, trajectory.device) for trajectory in self.trajectories}) > 1:
             raise ValueError("all trajectories must have one dtype and live on one device")
         self.columns = {name: np.asarray(column) for name, column in (columns or {}).items()}
+        if labels is not None:
+            if "labels" in self.columns:
+                raise ValueError("labels are given twice, the second time among the columns")
+            if isinstance(labels, str) or not all(isinstance(label, str) and label for label in labels):
+                raise ValueError(f"labels must be names, one for each demonstration, got {str(labels)[:80]}")
+            self.columns["labels"] = np.array(list(labels), dtype=np.str_)
         for name, column in self.columns.items():
             if column.shape[:1] != (len(self),):
                 raise ValueError(
@@ -82,6 +90,49 @@ class Demonstrations:
         """[N] seconds: T_i samples last (T_i - 1) / rate."""
         dtype = self.trajectories[0].dtype
         return (self.lengths.to(dtype) - 1) / self.rate
+
+    @property
+    def labels(self) -> tuple[str, ...] | None:
+        """Which interaction each demonstration shows, N names; None where nothing says."""
+        column = self.columns.get("labels")
+        return None if column is None or column.ndim != 1 else tuple(str(label) for label in column.tolist())
+
+    def assign(self, targets: Sequence[str] | None = None, sensors: Sequence[str] | None = None) -> Demonstrations:
+        """The same recordings with other roles: what is forecast is controlled, what is shown is not.
+
+        Modalities that are neither are left out; one that is both is shown, and stays observed. The order of the
+        columns stays.
+
+        Args:
+            targets: names of the modalities that are forecast; default: those that are controlled.
+            sensors: names of those that are shown; default: all others.
+
+        Raises:
+            ValueError: a name that there is not, or twice; no target; no sensor.
+        """
+        layout = self.layout
+        if targets is None:
+            targets = [modality.name for modality in layout.modalities if modality.controlled]
+        if sensors is None:
+            sensors = [name for name in layout.names if name not in targets]
+        for role, names in (("targets", targets), ("sensors", sensors)):
+            if isinstance(names, str) or len(set(names)) != len(names):
+                raise ValueError(f"{role} must be different names of modalities, got {names!r}")
+            for name in names:
+                layout.slice(name)
+            if not names:
+                raise ValueError(f"no {role}: name some of the modalities {', '.join(layout.names)}")
+        kept = [
+            Modality(m.name, m.dofs, m.unit, m.name in targets and m.name not in sensors)
+            for m in layout.modalities
+            if m.name in (*targets, *sensors)
+        ]
+        assigned = Layout(kept)
+        if assigned == layout:
+            return self
+        dofs = layout.mask(assigned.names)
+        parts = [trajectory[:, dofs] for trajectory in self.trajectories]
+        return Demonstrations(assigned, parts, self.rate, self.columns)
 
     def subset(self, indices: Sequence[int] | Sequence[bool] | Tensor) -> Demonstrations:
         """Some of the demonstrations, with their columns.

@@ -19,11 +19,6 @@ from torch_ebip.common.files import open_file, read_text
 from torch_ebip.recordings.arrays import MOST, Array, Recordings
 from torch_ebip.recordings.layout import Layout, Modality
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:  # pragma: no cover
-    import tomli as tomllib
-
 DESCRIPTION_LIMIT = 1 << 20
 """Bytes of a description."""
 CSV_LIMIT = 1 << 27
@@ -80,7 +75,7 @@ def _read_description(folder: Path) -> tuple[float, Layout]:
     try:
         if source is toml and _DOTTED.search(text):
             raise ValueError("a key of more than 16 parts")
-        description = tomllib.loads(text) if source is toml else json.loads(text)
+        description = _parse_toml(text) if source is toml else json.loads(text)
         rate = _entry(description, "rate", float, int)
         modalities = [_modality(entry) for entry in _entry(description, "modalities", list)]
         return float(rate), Layout(modalities)
@@ -88,6 +83,15 @@ def _read_description(folder: Path) -> tuple[float, Layout]:
         raise ValueError(f"{source}: lacks {error}") from error
     except (ValueError, OverflowError, RecursionError) as error:
         raise ValueError(f"{source}: {error}") from error
+
+
+def _parse_toml(text: str) -> Any:
+    """Imported here: before Python 3.11 it is a library of its own, which a robot does without."""
+    if sys.version_info >= (3, 11):
+        import tomllib
+    else:  # pragma: no cover
+        import tomli as tomllib
+    return tomllib.loads(text)
 
 
 def _modality(entry: Any) -> Modality:

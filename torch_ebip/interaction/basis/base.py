@@ -50,6 +50,14 @@ class Basis(nn.Module, ABC):
         _, slopes = self.evaluate(inside)
         return slopes * (1 + excess.abs() / self.margin).pow(-2).unsqueeze(-1)
 
+    def settings(self) -> dict[str, int | float | bool]:
+        """The arguments, exactly, that make an equal basis: what a model file keeps of it.
+
+        Raises:
+            TypeError: a family that does not say.
+        """
+        raise TypeError(f"{type(self).__name__} does not say how it is made: it has no method `settings`")
+
     def extra_repr(self) -> str:
         """The settings, as they are written in a constructor call; equal ones make equal bases."""
         return f"n_features={self.n_features}"

@@ -55,6 +55,10 @@ class BSplineBasis(Basis):
             values = values * local + coefficients[..., k, :]
         return values, slopes * pieces
 
+    def settings(self) -> dict[str, int | float | bool]:
+        """See `Basis.settings`."""
+        return {"n_features": self.n_features, "degree": self.degree}
+
     def extra_repr(self) -> str:
         """The settings; see `Basis.extra_repr`."""
         return f"n_features={self.n_features}, degree={self.degree}"

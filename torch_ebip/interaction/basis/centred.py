@@ -77,6 +77,10 @@ class CentredBasis(Basis):
             return steepness.to(phase), offsets.to(phase)
         return steepness, offsets
 
+    def settings(self) -> dict[str, int | float | bool]:
+        """See `Basis.settings`."""
+        return {"n_features": self.n_features, "width": self.width, "offset": self.offset}
+
     def extra_repr(self) -> str:
         """The settings; see `Basis.extra_repr`."""
         return f"n_features={self.n_features}, width={self.width:.6g}, offset={self.offset}"

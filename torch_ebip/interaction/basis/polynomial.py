@@ -43,6 +43,10 @@ class PolynomialBasis(Basis):
         value = torch.stack(values[: self.n_features], dim=-1) * scale
         return value, 2 * torch.stack(slopes[: self.n_features], dim=-1) * scale
 
+    def settings(self) -> dict[str, int | float | bool]:
+        """See `Basis.settings`."""
+        return {"degree": self.degree}
+
     def extra_repr(self) -> str:
         """The settings; see `Basis.extra_repr`."""
         return f"degree={self.degree}"
