@@ -108,8 +108,8 @@ def test_the_gradient_of_a_step_is_that_of_finite_differences() -> None:
     def loss() -> torch.Tensor:
         generator = torch.Generator().manual_seed(0)
         members = tuner.partition.members(torch.arange(4), generator)
-        part, trace, context = tuner._filter(torch.arange(4), SUBSETS["both"], shares, members, 0)
-        return torch.stack(list(objective(part, trace, *context).values())).sum()
+        trial = tuner.held_out.filter(made, torch.arange(4), SUBSETS["both"], shares, members, 0)
+        return torch.stack(list(trial.terms(objective).values())).sum()
 
     loss().backward()
     generator = torch.Generator().manual_seed(1)
@@ -209,12 +209,12 @@ def test_a_checkpoint_of_another_start_is_refused(tmp_path: Path) -> None:
 
 
 def test_horizons_stay_inside_however_coarse_the_thinning(tmp_path: Path) -> None:
-    _, tuner = filter_and_tuner(TuningSettings(folds=4, thinning=10, horizons=(0.9, 1.0)))
+    made, tuner = filter_and_tuner(TuningSettings(folds=4, thinning=10, horizons=(0.9, 1.0)))
     shares = torch.tensor([[0.97, 1.0]]).expand(24, 2)
     members = tuner.partition.members(torch.arange(24), torch.Generator())
-    _, trace, (_, _, now, _) = tuner._filter(torch.arange(24), SUBSETS["both"], shares, members, 0)
-    assert now.max() <= 1
-    assert trace.kept is not None
+    trial = tuner.held_out.filter(made, torch.arange(24), SUBSETS["both"], shares, members, 0)
+    assert trial.now.max() <= 1
+    assert trial.trace.kept is not None
 
 
 def test_checkpoints_execute_nothing(tmp_path: Path) -> None:

@@ -91,7 +91,7 @@ def configuration(tuner: Tuner) -> dict[str, Any]:
     """Everything on which the numbers of a tuning depend; a checkpoint of another one is refused."""
     settings = {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(tuner.settings).items()}
     shapes: Sequence[str] = [f"{name} {list(p.shape)}" for name, p in tuner.parameters.items()]
-    interactions = int(tuner.lengths.sum())
+    interactions = int(tuner.held_out.lengths.sum())
     masks = {name: mask.tolist() for name, mask in {**tuner.subsets, "targets": tuner.targets}.items()}
     return {
         **settings,

@@ -13,27 +13,22 @@ import time
 from collections.abc import Callable, Mapping
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from torch_ebip.common.ambient import own_modes, without_autocast
-from torch_ebip.common.draws import seeded
-from torch_ebip.filtering.trace import Trace
+from torch_ebip.common.ambient import own_modes
 from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.learning.checkpoint import load_checkpoint, save_checkpoint
 from torch_ebip.learning.configuration import complete, configuration
+from torch_ebip.learning.held_out import HeldOut
 from torch_ebip.learning.monitor import Monitor
 from torch_ebip.learning.objective import ForecastObjective
-from torch_ebip.learning.partition import Partition, generator_of
+from torch_ebip.learning.partition import generator_of
 from torch_ebip.learning.ranks import Ranks
 from torch_ebip.learning.settings import TuningResult, TuningSettings
 from torch_ebip.recordings.demonstrations import Demonstrations
-
-PORTION = 64
-"""Interactions that are filtered at once where none needs a gradient: more would only take memory."""
 
 
 class Tuner:
@@ -78,15 +73,14 @@ class Tuner:
     ) -> None:
         self.filter = filter
         task = complete(filter, demonstrations, primitive, objective, targets, subsets)
-        self.primitive, self.objective, self.targets, self.subsets = task
         self.settings = TuningSettings() if settings is None else settings
-        device = self.primitive.weights.device
-        self.monitor, self.progress = monitor, progress
         self.ranks = Ranks() if ranks is None else ranks
-        self.checkpoint = None if checkpoint is None else Path(checkpoint)
+        self.held_out = HeldOut(demonstrations, task, self.settings, self.ranks)
+        self.primitive, self.objective, self.targets, self.subsets = task
+        self.partition = self.held_out.partition
         self.layout = demonstrations.layout
-        self.values, self.observed = (tensor.to(device) for tensor in demonstrations.pad())
-        self.lengths = demonstrations.lengths.to(device)
+        self.monitor, self.progress = monitor, progress
+        self.checkpoint = None if checkpoint is None else Path(checkpoint)
         self.parameters = {
             name: parameter
             for name, parameter in filter.named_parameters()
@@ -95,7 +89,6 @@ class Tuner:
         if not self.parameters:
             names = ", ".join(name for name, _ in filter.named_parameters())
             raise ValueError(f"no parameter matches {self.settings.only}; there are {names}")
-        self.partition = Partition(len(demonstrations), self.settings)
         fewest = min(self.settings.batch_size, len(self.partition.training), len(self.partition.validating))
         if self.ranks.size > fewest:
             raise ValueError(f"{self.ranks.size} processes, but only {fewest} interactions to share among them")
@@ -133,40 +126,6 @@ class Tuner:
         kept = min(history, key=lambda key: history[key])
         return TuningResult(kept, history, step < settings.steps, time.monotonic() - began)
 
-    def _filter(
-        self, interactions: Tensor, subset: Tensor, shares: Tensor, members: Tensor, key: int
-    ) -> tuple[InteractionFilter, Trace, tuple[Any, ...]]:
-        """Filter this process's part of some interactions.
-
-        Args:
-            interactions: int64 [B].
-            subset: bool [D], of sensors that are shown.
-            shares: [B, K], up to which parts of their length.
-            members: int64 [B, E], their ensembles.
-            key: of the draws, with the seed and the interaction.
-        """
-        mine = slice(self.ranks.rank, None, self.ranks.size)
-        interactions, shares, members = interactions[mine], shares[mine], members[mine]
-        draws = [seeded(self.settings.seed, key, interaction) for interaction in interactions.tolist()]
-        kept_dofs = subset | self.targets
-        stride, device = self.settings.thinning, self.lengths.device
-        interactions, shares, members = interactions.to(device), shares.to(device), members.to(device)
-        part = self.filter.restrict(kept_dofs, stride)
-        last = (self.lengths[interactions] - 1).unsqueeze(-1)
-        steps = torch.minimum((shares * last / stride).round().long(), last // stride)
-        length = int(steps.max()) + 1
-        y = self.values[interactions, ::stride][:, :length][..., kept_dofs]
-        observed = self.observed[interactions, ::stride][:, :length][..., kept_dofs] & subset[kept_dofs]
-        within = torch.arange(length, device=steps.device).view(1, -1, 1) <= steps.amax(-1).view(-1, 1, 1)
-        observed = observed & within
-        state = part.initial_state((len(interactions),), members, draws)
-        segment = self.settings.segment if torch.is_grad_enabled() else None
-        trace = part(y, observed, state=state, generator=draws, keep=steps, segment=segment or None, project=False)
-        now = (steps * stride / last).to(y)
-        weights = self.primitive.weights[interactions, None, None, :]
-        truth = self.primitive.basis.project(self.objective.phases_ahead(now), weights)[..., self.targets]
-        return part, trace, (observed, truth, now, self.targets[kept_dofs])
-
     def _step(self, step: int, optimizer: torch.optim.Optimizer) -> float:
         settings, began = self.settings, time.monotonic()
         generator = generator_of(settings.seed, step)
@@ -178,16 +137,17 @@ class Tuner:
         draws = torch.rand(len(picked), settings.horizons_each, generator=generator, device="cpu")
         picked = self.partition.training[picked]
         members = self.partition.members(picked, generator)
-        part, trace, context = self._filter(picked, self.subsets[name], low + (high - low) * draws, members, step)
-        terms = self.objective(part, trace, *context)
+        shares = low + (high - low) * draws
+        trial = self.held_out.filter(self.filter, picked, self.subsets[name], shares, members, step)
+        terms = trial.terms(self.objective)
         terms["pull"] = settings.pull * self._distance()
         optimizer.zero_grad(set_to_none=True)
-        weight = len(context[0]) / len(picked)
+        weight = len(trial.observed) / len(picked)
         (weight * torch.stack(list(terms.values())).sum()).backward()  # type: ignore[no-untyped-call]
         # The pull sees every parameter, so that all have a gradient.
         self.ranks.add_up([parameter.grad for parameter in self.parameters.values() if parameter.grad is not None])
         values = {key: float(value.detach()) for key, value in terms.items()}
-        values["samples"] = int(context[0].any(-1).sum()) / weight
+        values["samples"] = int(trial.observed.any(-1).sum()) / weight
         values = self.ranks.mean(values, weight)
         samples = values.pop("samples")
         total = sum(values.values())
@@ -205,48 +165,14 @@ class Tuner:
             self.monitor.scalars(scalars, step)
         return total
 
-    @without_autocast
-    @torch.no_grad()
     def evaluate(self, interactions: Tensor | None = None, shares: Tensor | None = None) -> dict[str, float]:
-        """Scores of the filter as it is, always at the same horizons and draws; nothing is reported or changed.
+        """Scores of the filter as it is, at the same horizons and draws whenever it is asked: see `HeldOut.evaluate`.
 
         Args:
-            interactions: int64 [B], which demonstrations; default: those kept for validation. Each is filtered
-                by an ensemble that does not contain it.
+            interactions: int64 [B], which demonstrations; default: those kept for validation.
             shares: [K], of an interaction that are shown; default: four evenly within the settings' horizons.
-
-        Returns:
-            ``loss``, its terms, ``subset/NAME`` the loss of each subset, and ``spread`` and ``error`` of the
-            forecasts of the end in units of the targets' spread over the demonstrations.
         """
-        interactions = self.partition.validating if interactions is None else interactions
-        low, high = self.settings.horizons
-        shares = low + (high - low) * (torch.arange(4, device="cpu") + 0.5) / 4 if shares is None else shares
-        if self.ranks.size > len(interactions):
-            raise ValueError(f"{self.ranks.size} processes, but only {len(interactions)} interactions to share")
-        totals: dict[str, list[float]] = {}
-        members = self.partition.members(interactions, generator_of(self.settings.seed, -1))
-        portion = PORTION * self.ranks.size
-        for name, subset in self.subsets.items():
-            sums: dict[str, float] = {}
-            for some, theirs in zip(torch.split(interactions, portion), torch.split(members, portion), strict=True):
-                if len(some) <= self.ranks.rank:  # fewer are left than there are processes
-                    continue
-                part, trace, context = self._filter(some, subset, shares.expand(len(some), -1), theirs, -1)
-                terms = {key: float(value) for key, value in self.objective(part, trace, *context).items()}
-                terms[f"subset/{name}"] = sum(terms.values())
-                squares = self.objective.spread_and_error(part, trace, context[1], context[3]).square()
-                terms["spread"], terms["error"] = squares.tolist()
-                for key, value in terms.items():
-                    sums[key] = sums.get(key, 0.0) + value * len(context[0])
-            mine = len(self.ranks.shard(range(len(interactions))))
-            means = self.ranks.mean({key: value / mine for key, value in sums.items()}, mine)
-            for key, value in means.items():
-                totals.setdefault(key, []).append(value)
-        overall = {key: sum(values) / len(values) for key, values in totals.items()}
-        spread, error = math.sqrt(overall.pop("spread")), math.sqrt(overall.pop("error"))
-        loss = sum(value for key, value in overall.items() if not key.startswith("subset/"))
-        return {**overall, "loss": loss, "spread": spread, "error": error}
+        return self.held_out.evaluate(self.filter, interactions, shares)
 
     def _validate(self, step: int) -> float:
         scores = self.evaluate()
