@@ -32,6 +32,7 @@ from torch_ebip.interaction.presets import bip, ebip, ebip_minus, particle_filte
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.interaction.priors import DemonstrationPrior, MomentPrior
 from torch_ebip.interaction.projection import BasisProjection
+from torch_ebip.interaction.shrinkage import Shrinkage
 from torch_ebip.interaction.table import DemonstrationTable
 from torch_ebip.interaction.trace import InteractionTrace
 
@@ -58,6 +59,7 @@ __all__ = [
     "PhaseGatedNoise",
     "PhaseNoise",
     "PolynomialBasis",
+    "Shrinkage",
     "SigmoidBasis",
     "StackedBasis",
     "WeightNoise",

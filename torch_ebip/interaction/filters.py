@@ -18,12 +18,13 @@ from torch_ebip.filtering.ensemble import EnsembleFilter
 from torch_ebip.filtering.extended import ExtendedFilter, GaussianState
 from torch_ebip.filtering.members import MemberFilter
 from torch_ebip.filtering.particle import ParticleFilter
-from torch_ebip.filtering.protocols import MayLeaveSpan
+from torch_ebip.filtering.protocols import MayLeaveSpan, View
 from torch_ebip.filtering.states import State
 from torch_ebip.interaction.attribution import affine_coefficients
 from torch_ebip.interaction.forecast import Forecast
 from torch_ebip.interaction.phases.phase import PhaseModel
 from torch_ebip.interaction.projection import BasisProjection
+from torch_ebip.interaction.shrinkage import Shrinkage
 from torch_ebip.interaction.trace import InteractionTrace
 
 Phases: TypeAlias = Tensor | Sequence[float] | float
@@ -44,17 +45,36 @@ def as_phases(phase: Phases, like: Tensor) -> Tensor:
     return phase.reshape(1) if phase.ndim == 0 else phase
 
 
+def as_seconds_ahead(ahead: Phases, like: Tensor) -> Tensor:
+    """Seconds [P] of a forecast, infinity allowed, in the dtype and on the device of ``like``; one number is [1].
+
+    Raises:
+        ValueError: NaN or negative numbers, more than one dimension.
+    """
+    seconds = ahead if isinstance(ahead, Tensor) else as_values("ahead", ahead, None, like)
+    seconds = outside_inference(seconds.to(like))
+    seconds = seconds.reshape(1) if seconds.ndim == 0 else seconds
+    if seconds.ndim != 1 or not bool((seconds >= 0).all()):
+        raise ValueError(f"ahead must be seconds [P], 0 or more, got {seconds.tolist()}")
+    return seconds
+
+
 class InteractionFilter(Filter):
     """A filter over an `interaction_model`: its states are what moves, the phase first, and the weights.
+
+    Attributes:
+        readout: what its forecasts pass through, a `Shrinkage`; None: nothing.
 
     Raises:
         ValueError: a model that is not one of an interaction, or a prior without demonstrations.
     """
 
     _trace = InteractionTrace
+    readout: Shrinkage | None
 
     def _check(self) -> None:
         """See `Filter._check`."""
+        self.readout = None
         model = self.model
         if not isinstance(model.dynamics, PhaseModel) or not isinstance(model.measurement, BasisProjection):
             raise ValueError(
@@ -101,17 +121,52 @@ class InteractionFilter(Filter):
         """[...], mean phase velocity of a state, 1/s."""
         return self.phase_model.velocity(self.moving(state))
 
-    @abstractmethod
-    def forecast(self, state: State, phase: Phases | None = None) -> Forecast:
-        """The trajectory that the state implies.
+    def _narrow(self, view: View) -> None:
+        """See `Filter._narrow`."""
+        super()._narrow(view)
+        if self.readout is not None:
+            self.readout = self.readout.select(view)
+
+    @eager
+    def forecast(self, state: State, phase: Phases | None = None, *, ahead: Phases | None = None) -> Forecast:
+        """The trajectory that the state implies, after the `readout`.
 
         Args:
             state: of this filter.
             phase: [P] or [..., P], or one number; default: 50 phases evenly from the current one to 1.
+            ahead: instead of phases: seconds, [P] or one number, each member at its own velocity; infinity, and
+                what lies behind the end, is the end. `Forecast.phase` is then the mean of the members'.
 
         Raises:
-            ValueError: phases that are NaN or infinite.
+            ValueError: phases that are NaN or infinite; seconds that are NaN or negative; both.
         """
+        if ahead is not None and phase is not None:
+            raise ValueError("a forecast is of phases or of seconds ahead, got both")
+        if ahead is not None:
+            forecast = self._forecast_ahead(state, as_seconds_ahead(ahead, state[0]))
+        else:
+            forecast = self._forecast(state, self._phases_ahead(state, phase))
+        if self.readout is None:
+            return forecast
+        now = self.phase(state).clamp(0, 1).unsqueeze(-1)
+        lead = (forecast.phase - now).clamp(min=0)
+        result: Forecast = self.readout(forecast, lead, *self.demonstrated(forecast.phase.clamp(0, 1)))
+        return result
+
+    @abstractmethod
+    def _forecast(self, state: State, phase: Tensor) -> Forecast:
+        """What a state implies at phases [P] or [..., P]."""
+
+    @abstractmethod
+    def _forecast_ahead(self, state: State, ahead: Tensor) -> Forecast:
+        """What a state implies so many seconds ahead, [P]; infinity is the end."""
+
+    def demonstrated(self, phase: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and variance of the demonstrations at phases [..., P]: [..., P, D], units of the DoFs and squared."""
+        weights = self.prior.states[:, self.phase_model.moving :]  # type: ignore[index]
+        mean = weights.mean(0)
+        paths = self.basis_projection.basis.project_paths(phase.unsqueeze(-2), weights - mean)
+        return self.basis_projection.basis.project_paths(phase, mean), paths.var(-3)
 
     def attribution(self, state: State) -> Tensor:
         """Which demonstrations speak: the mean forecast is this affine combination of their trajectories.
@@ -162,20 +217,36 @@ class InteractionMemberFilter(InteractionFilter, MemberFilter):
         phase = phase.to(members).expand(*members.shape[:-2], -1)
         return project_at(members, phase), None if centre is None else project_at(centre.unsqueeze(-2), phase)
 
-    @eager
-    def forecast(self, state: State, phase: Phases | None = None) -> Forecast:
+    def _forecast(self, state: State, phase: Tensor) -> Forecast:
         """Steps 4 and 5 of the paper's box: mean and variance over members of h at phases [..., P] to come.
 
         At a given phase h is linear in the weights, so the mean of h is h of the mean, the paper's output.
-        See `InteractionFilter.forecast`.
-
-        Args:
-            state: of this filter.
-            phase: [P] or [..., P], or one number; default: 50 phases evenly from the current one to 1.
         """
-        phase = self._phases_ahead(state, phase)
         departures, path = self._paths_ahead(state, phase)
         phase = phase.to(departures).expand(departures.shape[:-2])
+        return self._of_members(state, phase, departures, path)
+
+    def _forecast_ahead(self, state: State, ahead: Tensor) -> Forecast:
+        """See `InteractionFilter._forecast_ahead`: every member at the phase where it will be."""
+        m, basis, members = self.phase_model.moving, self.basis_projection.basis, state[0]
+        moving = self.model.split(members)[0]
+        now, velocity = moving[..., 0].unsqueeze(-2), self.phase_model.velocity(moving).unsqueeze(-2)
+        end = ahead.isinf().unsqueeze(-1)
+        phase = now + velocity * torch.where(end, 0, ahead.unsqueeze(-1))
+        phase = torch.where(end, 1, phase).clamp(max=1)
+        departures = basis.project(phase, members[..., m:].unsqueeze(-3))
+        weights = None if state.weights is None else state.weights.unsqueeze(-2)
+        mean = functional.ensemble_mean(phase.unsqueeze(-1), weights).squeeze(-1)
+        centre, path = self._centre(state), None
+        if centre is not None:
+            # Members differ by where they are along the centre's path, too.
+            still = centre[..., m:].unsqueeze(-2)
+            path = basis.project(mean, still).unsqueeze(-2)
+            departures = departures + (basis.project(phase, still.unsqueeze(-2)) - path)
+        return self._of_members(state, mean, departures, path)
+
+    def _of_members(self, state: State, phase: Tensor, departures: Tensor, path: Tensor | None) -> Forecast:
+        """The forecast of members that differ by ``departures`` from a path that they share."""
         weights = None if state.weights is None else state.weights.unsqueeze(-2).expand(departures.shape[:-1])
         mean = functional.ensemble_mean(departures, weights)
         variance = functional.ensemble_variance(departures, weights, self.fair)
@@ -199,16 +270,15 @@ class InteractionParticleFilter(InteractionMemberFilter, ParticleFilter):
 class InteractionExtendedFilter(InteractionFilter, ExtendedFilter):
     """The paper's BIP: an `ExtendedFilter` of an interaction, made by `bip`."""
 
-    @eager
-    def forecast(self, state: GaussianState, phase: Phases | None = None) -> Forecast:
-        """h(phi, mu) and Phi(phi) Sigma_ww Phi(phi)' at phases [..., P] to come; see `InteractionFilter.forecast`.
+    def _forecast_ahead(self, state: GaussianState, ahead: Tensor) -> Forecast:
+        """See `InteractionFilter._forecast_ahead`: at the mean velocity."""
+        now, velocity = self.phase(state).unsqueeze(-1), self.phase_velocity(state).unsqueeze(-1)
+        phase = torch.where(ahead.isinf(), 1, now + velocity * torch.where(ahead.isinf(), 0, ahead)).clamp(max=1)
+        return self._forecast(state, phase)
 
-        Args:
-            state: of this filter.
-            phase: [P] or [..., P], or one number; default: 50 phases evenly from the current one to 1.
-        """
+    def _forecast(self, state: GaussianState, phase: Tensor) -> Forecast:
+        """h(phi, mu) and Phi(phi) Sigma_ww Phi(phi)' at phases [..., P] to come."""
         basis, m = self.basis_projection.basis, self.phase_model.moving
-        phase = self._phases_ahead(state, phase)
         phase = phase.to(state.mean).expand(*state.mean.shape[:-1], phase.shape[-1])
         mean = basis.project(phase, state.mean[..., m:].unsqueeze(-2))
         # Where the prior is rank deficient rounding can leave less than nothing.

@@ -154,17 +154,20 @@ class LiveFilter:
 
     @in_own_modes
     @torch.no_grad()
-    def forecast(self, phase: Phases | None = None, dofs: Tensor | None = None) -> Forecast:
+    def forecast(
+        self, phase: Phases | None = None, dofs: Tensor | None = None, *, ahead: Phases | None = None
+    ) -> Forecast:
         """See `InteractionFilter.forecast`; of some DoFs only, bool [D], if given, which costs less than all.
 
         Args:
             phase: [P] or one number; default: 50 phases evenly from the current one to 1.
             dofs: bool [D].
+            ahead: seconds, [P] or one number, instead of phases.
         """
         D = self.filter.n_dofs
         chosen = (True,) * D if dofs is None else tuple(as_mask("dofs", dofs, D).tolist())
         part, columns = kept(self._forecasters, chosen, self._make_forecaster)
-        return part.forecast(self.carrier.state(columns), phase)
+        return part.forecast(self.carrier.state(columns), phase, ahead=ahead)
 
     @in_own_modes
     @torch.no_grad()
