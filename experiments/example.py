@@ -38,7 +38,9 @@ def make(seed: int = 0) -> Demonstrations:
         aim = place - (rest + torch.tensor([-0.2, 0.0, 0.6]))
         angles = torch.stack([torch.atan2(aim[1], aim[0]), torch.atan2(aim[2], aim[:2].norm())])
         gaze = angles * _reach((phase / 0.45).clamp(max=1)) + 0.03 * torch.randn(length, 2, generator=draws).double()
-        joints = home + (_joints_at(arm, home, place) - home) * _reach(((phase - 0.3) / 0.7).clamp(min=0))
+        goal = _joints_at(arm, home, place)
+        goal[-1] = angles[0]  # the gripper turns to where the person comes from
+        joints = home + (goal - home) * _reach(((phase - 0.3) / 0.7).clamp(min=0))
         hand = hand + 0.004 * torch.randn(length, 3, generator=draws).double()
         paths.append(torch.cat([hand, gaze, joints], -1).float())
     layout = Layout(

@@ -158,6 +158,30 @@ class InteractionPrimitive(Meaning):
         one = torch.ones(len(self), dtype=self.weights.dtype, device=self.weights.device)
         return self.basis.project(one, self.weights - self.weights.mean(0)).var(0)
 
+    def extend(self, demonstrations: Demonstrations) -> InteractionPrimitive:
+        """The same basis and noise with more demonstrations: at least one, which need no more than a regression.
+
+        Args:
+            demonstrations: in the dtype and on the device of this primitive.
+
+        Raises:
+            ValueError: see `fit`.
+        """
+        # A primitive is of two at least: of one, the second is the same again.
+        several = demonstrations if len(demonstrations) > 1 else demonstrations.subset([0, 0])
+        more = InteractionPrimitive.fit(several, self.basis)
+        return InteractionPrimitive(
+            self.layout,
+            self.basis,
+            self.rate,
+            torch.cat([self.weights, more.weights[: len(demonstrations)]]),
+            torch.cat([self.phase_velocity, more.phase_velocity[: len(demonstrations)]]),
+            self.residual_variance,
+            self.residual_correlation_time,
+            self.value_variance,
+            torch.maximum(self.longest_repeat, more.longest_repeat),
+        )
+
     def subset(self, indices: Sequence[int] | Sequence[bool] | Tensor) -> InteractionPrimitive:
         """The same basis and noise with some of the demonstrations: they need no new regression.
 

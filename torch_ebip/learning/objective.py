@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -159,6 +160,27 @@ class ForecastObjective(Meaning):
         error = (forecast.mean[..., 0, :] - truth[..., -1, :]) / self.scale
         variance = forecast.variance / self.scale.square()
         return torch.stack([variance.mean().sqrt(), error.square().mean().sqrt()])
+
+
+def joints_of(arm: RobotArm, layout: Layout, targets: Sequence[str]) -> list[str]:
+    """The target modality that holds an arm's joints: by their names, or because only it has as many DoFs.
+
+    Args:
+        arm: whose joints they are.
+        layout: of the recordings.
+        targets: names of modalities.
+
+    Raises:
+        ValueError: none does, or several.
+    """
+    named = [name for name in targets if set(layout[name].dofs) & set(arm.joint_names)]
+    alike = named or [name for name in targets if len(layout[name].dofs) == arm.n_joints]
+    if len(alike) != 1:
+        raise ValueError(
+            f"no target is the arm's {arm.n_joints} joints ({', '.join(arm.joint_names)}): "
+            f"{', '.join(f'{name} has {len(layout[name].dofs)} DoFs' for name in targets)}; say which with `joints`"
+        )
+    return alike
 
 
 def _joints(arm: RobotArm, layout: Layout, dofs: Tensor, targets: list[str]) -> list[int]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
 
 from torch_ebip.common.arguments import as_count, as_number
+from torch_ebip.recordings.demonstrations import Demonstrations
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,44 @@ class TuningSettings:
             raise ValueError(f"validation must be a share between 0 and 1, got {self.validation}")
 
 
+SAMPLES = 14
+"""How many samples of an interaction are used while tuning: neighbouring ones say nearly the same."""
+MANY = 400
+"""Members while tuning, at most: more only take time."""
+
+
+def settings_for(
+    demonstrations: Demonstrations, steps: int, seed: int, members: int | None, others: Mapping[str, Any]
+) -> TuningSettings:
+    """What suits so many demonstrations, unless told otherwise.
+
+    With few there are fewer folds and a stronger pull towards the start; with thousands ensembles are smaller while
+    tuning.
+
+    Args:
+        demonstrations: N of them.
+        steps, seed: see `TuningSettings`.
+        members: E while tuning; default: all of the other folds, up to `MANY`.
+        others: further settings by name.
+
+    Raises:
+        ValueError: a setting that there is not, or outside its range.
+    """
+    known = {field.name for field in fields(TuningSettings)}
+    strangers = [name for name in others if name not in known]
+    if strangers:
+        raise ValueError(f"no setting {', '.join(strangers)}; there are {', '.join(sorted(known))}")
+    N = len(demonstrations)
+    settings: dict[str, Any] = {
+        "folds": min(5, N),
+        "pull": 0.01 * max(1.0, (20 / N) ** 2),
+        "thinning": max(1, round(float(demonstrations.lengths.double().median()) / SAMPLES)),
+        "n_members": MANY if members is None and N - -(-N // 5) > MANY else members,
+        **others,
+    }
+    return TuningSettings(steps=steps, seed=seed, **settings)
+
+
 class TuningResult(NamedTuple):
     """How a tuning went.
 
@@ -76,9 +116,11 @@ class TuningResult(NamedTuple):
         validation: the loss by step.
         stopped_early: whether patience ended before the steps did.
         seconds: that it took.
+        interrupted_at: the step at which Ctrl-C ended it; None if it did not.
     """
 
     best_step: int
     validation: dict[int, float]
     stopped_early: bool
     seconds: float
+    interrupted_at: int | None = None

@@ -94,7 +94,10 @@ class Tuner:
             raise ValueError(f"{self.ranks.size} processes, but only {fewest} interactions to share among them")
 
     def run(self) -> TuningResult:
-        """Tune, and leave the parameters of the best validation in the filter."""
+        """Tune, and leave the parameters of the best validation in the filter.
+
+        Ctrl-C ends it where it is: the best so far is kept, and the result says so.
+        """
         with own_modes(), torch.inference_mode(False), torch.enable_grad():
             return self._run()
 
@@ -110,21 +113,27 @@ class Tuner:
         if not history:
             history[0] = self._validate(0)
         waited = _waited(history)
-        step = start
-        while step < settings.steps and waited < settings.patience:
-            step += 1
-            loss = self._step(step, optimizer)
-            if step % settings.validate_every == 0 or step == settings.steps:
-                history[step] = self._validate(step)
-                if history[step] == min(history.values()):
-                    best = self._snapshot()
-                waited = _waited(history)
-                self._save(step, optimizer, best, history)
-            if self.progress is not None:
-                self.progress(step, loss, history[max(history)])
+        step, interrupted = start, None
+        try:
+            while step < settings.steps and waited < settings.patience:
+                step += 1
+                loss = self._step(step, optimizer)
+                if step % settings.validate_every == 0 or step == settings.steps:
+                    history[step] = self._validate(step)
+                    if history[step] == min(history.values()):
+                        best = self._snapshot()
+                    waited = _waited(history)
+                    self._save(step, optimizer, best, history)
+                if self.progress is not None:
+                    self.progress(step, loss, history[max(history)])
+        except KeyboardInterrupt:
+            if self.ranks.size > 1:  # the others wait for this one
+                raise
+            interrupted = step
         self._restore(best)
         kept = min(history, key=lambda key: history[key])
-        return TuningResult(kept, history, step < settings.steps, time.monotonic() - began)
+        stopped = interrupted is None and step < settings.steps
+        return TuningResult(kept, history, stopped, time.monotonic() - began, interrupted)
 
     def _step(self, step: int, optimizer: torch.optim.Optimizer) -> float:
         settings, began = self.settings, time.monotonic()

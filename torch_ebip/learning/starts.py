@@ -1,0 +1,159 @@
+"""Where the gradient starts: a factor on the closed-form R, and how sharply the evidence weighs.
+
+Both are searched for on interactions that are left out. One factor is what a sceptic does instead of gradients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import product
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_ebip.common.files import read_json, write_json
+from torch_ebip.filtering.noise.constraints import AboveOne
+from torch_ebip.filtering.updates.trust import RobustWeights
+from torch_ebip.interaction.basis.bspline import BSplineBasis
+from torch_ebip.interaction.filters import InteractionEnsembleFilter, InteractionFilter
+from torch_ebip.interaction.presets import ebip
+from torch_ebip.interaction.primitive import InteractionPrimitive
+from torch_ebip.learning.held_out import HeldOut
+
+FACTORS = (1.0, 10.0, 100.0, 1000.0, 10000.0)
+"""Coarse grid of factors on the closed-form R; the best one is refined by half-decades."""
+SHARPNESSES = (3.16, 10.0, 31.6)
+"""Of the evidence weights, tried with every half-decade of R up to the best factor."""
+INFLATION = 1.002
+"""Of the anomalies a sample, where the gradient starts."""
+
+
+class Start(NamedTuple):
+    """Where the gradient starts: a factor on R, and the sharpness of the evidence weights."""
+
+    factor: float
+    sharpness: float
+
+
+def scaled(primitive: InteractionPrimitive, factor: float, members: int | None = None) -> InteractionEnsembleFilter:
+    """The paper's eBIP of a primitive with its R times one factor, and an ensemble of so many members."""
+    return ebip(primitive, members, residual_variance=factor * primitive.residual_variance)
+
+
+def tunable(
+    primitive: InteractionPrimitive, start: Start, members: int | None = None, robust: RobustWeights | None = None
+) -> InteractionEnsembleFilter:
+    """What is tuned: square-root eBIP whose R depends on phase, with inflation and evidence weights.
+
+    Args:
+        primitive: of the demonstrations.
+        start: where the gradient starts.
+        members: E; default: all demonstrations.
+        robust: what surprising measurements count; default: as much as others.
+    """
+    return ebip(
+        primitive,
+        members,
+        residual_variance=start.factor * primitive.residual_variance,
+        context=BSplineBasis(4),
+        robust=robust,
+        inflation=AboveOne(primitive.weights.new_tensor(INFLATION)),
+        square_root=True,
+        weigh=True,
+        sharpness=start.sharpness,
+    )
+
+
+def scanned(held_out: HeldOut, count: int) -> Tensor:
+    """int64 [M], at most ``count`` of the demonstrations: those that decide where to start."""
+    generator = torch.Generator("cpu").manual_seed(held_out.settings.seed + 1)
+    return torch.randperm(len(held_out.task.primitive), generator=generator, device="cpu")[:count]
+
+
+def best_factor(
+    held_out: HeldOut,
+    build: Callable[[InteractionPrimitive, float], InteractionFilter],
+    interactions: int,
+    factors: Sequence[float] = FACTORS,
+    record: Path | None = None,
+    tick: Callable[[], None] = lambda: None,
+) -> float:
+    """The factor on R with the smallest loss on interactions left out.
+
+    Args:
+        held_out: the demonstrations, and what is asked of them.
+        build: a filter from a primitive and a factor.
+        interactions: how many of them decide.
+        factors: grid; half-decades around its best one are tried too.
+        record: file of the losses, written when all are known; if it exists, its best factor is returned.
+        tick: called after each filter that was tried.
+
+    Raises:
+        ValueError: a record that is none.
+    """
+    if record is not None and record.exists():
+        content = read_json(record)
+        try:
+            stored = {float(factor): loss for factor, loss in content.items()}
+            return min(stored, key=lambda factor: stored[factor])
+        except (AttributeError, TypeError, ValueError) as error:
+            raise ValueError(f"{record}: expected a loss for every factor: {error}") from error
+    losses: dict[float, float] = {}
+    order = scanned(held_out, interactions)
+
+    def measure(factors: Sequence[float]) -> None:
+        for factor in factors:
+            if factor not in losses:
+                losses[factor] = held_out.evaluate(build(held_out.task.primitive, factor), order)["loss"]
+            tick()
+
+    measure(factors)
+    best = min(losses, key=lambda factor: losses[factor])
+    measure([float(f"{best * 10**half:.4g}") for half in (-0.5, 0.5)])
+    if record is not None and held_out.ranks.first:
+        write_json(record, losses)
+    return min(losses, key=lambda factor: losses[factor])
+
+
+def best_start(
+    held_out: HeldOut,
+    factor: float,
+    interactions: int,
+    members: int | None = None,
+    record: Path | None = None,
+    tick: Callable[[], None] = lambda: None,
+) -> Start:
+    """The start of `tunable` with the smallest loss, among half-decades of R up to a factor, and `SHARPNESSES`.
+
+    The factor is the best one without evidence weights, which take over a part of what a large R is for.
+
+    Args:
+        held_out: the demonstrations, and what is asked of them.
+        factor: the best one, see `best_factor`.
+        interactions: how many of them decide.
+        members: E of the filter.
+        record: file of the losses, written when all are known; if it exists, its best start is returned.
+        tick: called after each filter that was tried.
+
+    Raises:
+        ValueError: a record that is none.
+    """
+    if record is None or not record.exists():
+        order = scanned(held_out, interactions)
+        losses: list[dict[str, float]] = []
+        for half, sharpness in product((-1.0, -0.5, 0.0), SHARPNESSES):
+            start = Start(float(f"{factor * 10**half:.4g}"), sharpness)
+            filter = tunable(held_out.task.primitive, start, members)
+            losses.append({**start._asdict(), "loss": held_out.evaluate(filter, order)["loss"]})
+            tick()
+        if record is not None and held_out.ranks.first:
+            write_json(record, losses)
+    else:
+        losses = read_json(record)
+    try:
+        best = min(losses, key=lambda entry: entry["loss"])
+        return Start(best["factor"], best["sharpness"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{record}: expected a list of starts with their losses: {error}") from error
