@@ -226,7 +226,7 @@ def test_a_recording_that_starts_on_a_full_disk_names_its_path_and_leaves_nothin
         ({"window": 70.0}, [], "a window or a gap of more than 2000 ticks"),
         ({"longest_gap": 1e5}, [], "a window or a gap of more than 2000 ticks"),
         (
-            {"longest_gap": 60.0},
+            {"longest_gap": 60.0, "start": 0.0},
             [["advance", 50.0], ["advance", 100.0], ["advance", 150.0]],
             "ticks to filter already",
         ),

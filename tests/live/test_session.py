@@ -310,7 +310,7 @@ def test_sensors_that_say_nothing_are_stale() -> None:
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 2, 0)])
 def test_of_a_faster_sensor_the_nearest_sample_counts(order: tuple[int, ...]) -> None:
     stream = samples()
-    exact, fast = live(), live()
+    exact, fast = live(start=0.0), live(start=0.0)
     for sensor, value, time in stream:
         exact.push(sensor, value, time)
         pushes = [(time, value), (time + 0.3 * DT, value[::-1]), (time - 0.2 * DT, tuple(0.5 * v for v in value))]
@@ -419,7 +419,7 @@ def test_memory_does_not_grow() -> None:
         (lambda: live(start=math.inf), "start must be finite"),
         (lambda: live().forecast(math.nan), "horizons must be finite"),
         (lambda: live().forecast(now=math.nan), "now must be a finite"),
-        (lambda: live().advance(1e6), "more than the longest gap"),
+        (lambda: live(start=0.0).advance(1e6), "more than the longest gap"),
     ],
 )
 def test_mistakes_of_the_caller_are_explained(make: Callable[[], Any], message: str) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 from torch import Tensor
 
+from torch_ebip.common.arguments import as_number
 from torch_ebip.common.brief import brief
 
 
@@ -19,6 +21,7 @@ class SessionForecast(NamedTuple):
         dofs: names of the controlled DoFs, D_c of them.
         mean, deviation: [D_c], or [P, D_c] for P horizons: expected values and their standard deviations.
         stale: names of the sensors of which nothing was used for a while, or ever.
+        horizon: seconds from the present that were asked for, P of them; empty for the end alone.
     """
 
     time: float
@@ -28,6 +31,29 @@ class SessionForecast(NamedTuple):
     mean: Tensor
     deviation: Tensor
     stale: tuple[str, ...]
+    horizon: tuple[float, ...] = ()
 
     def __repr__(self) -> str:
         return brief(self)
+
+
+MOST_POINTS = 10_000
+"""Of a way that is sampled."""
+
+
+def sampled(end: float, rate: float) -> list[float]:
+    """Seconds from now, from one step of a controller on up to an end, s, and the end itself.
+
+    Args:
+        end: s, of the way.
+        rate: Hz, of the controller.
+
+    Raises:
+        ValueError: a rate that is not positive, or more than `MOST_POINTS`.
+    """
+    rate = as_number("rate", rate, 0, above=True, of="of points a second")
+    count = math.floor(max(end, 0.0) * rate * (1 + 1e-9))
+    if count > MOST_POINTS:
+        raise ValueError(f"{end:g} s at {rate:g} Hz are {count} points, expected at most {MOST_POINTS}")
+    points = [i / rate for i in range(1, count + 1)]
+    return points if points and end - points[-1] < 1e-6 else [*points, max(end, 0.0)]

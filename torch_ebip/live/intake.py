@@ -162,6 +162,20 @@ class Intake:
         slot.values[columns] = vector
         return tick
 
+    def says_something(self, modality: int, values: Any, time: Any) -> bool:
+        """Whether a sample of a sensor has a time and a value that can be; nothing is counted or stored.
+
+        Args:
+            modality: number of the sensor.
+            values: [k] numbers, units of the DoFs.
+            time: when it was taken, s.
+        """
+        columns = self.columns[modality]
+        vector = as_vector(values, columns.stop - columns.start)
+        if vector is None or not math.isfinite(as_number(time)):
+            return False
+        return not bool(np.isnan(self._plausible(vector, columns, SensorReport())).all())
+
     def at(self, tick: int) -> Array:
         """What was measured at a tick, [D]; NaN where nothing was. Not to be changed."""
         slot = self._ring[tick % len(self._ring)]

@@ -18,16 +18,15 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-import torch
 
 from torch_ebip.common.ambient import in_own_modes
 from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.primitive import InteractionPrimitive
-from torch_ebip.live.engine import make_engine
-from torch_ebip.live.forecast import SessionForecast
-from torch_ebip.live.intake import Freshness, Intake, SensorReport, as_number, as_vector, training_ranges
+from torch_ebip.live.forecast import SessionForecast, sampled
+from torch_ebip.live.intake import SensorReport, as_number
 from torch_ebip.live.log import SessionLog, fingerprint
-from torch_ebip.live.settings import SessionSettings, patience_of
+from torch_ebip.live.settings import SessionSettings
+from torch_ebip.live.timeline import Timeline
 
 TOLERANCE = 1e-3
 """Ticks by which a time may be short of a tick and still be it: clocks that count from 1970 round to microseconds."""
@@ -84,25 +83,9 @@ class InteractionSession:
         self.settings = settings = SessionSettings() if settings is None else settings
         self.sensors, self.dt = tuple(sensors), filter.dt
         self.dofs = tuple(dof for dof, ours in zip(layout.dofs, layout.controlled.tolist(), strict=True) if ours)
-        self._patience = patience_of(settings.frozen_after, primitive, self.sensors)
         self._numbers = {name: i for i, name in enumerate(self.sensors)}
-        # A sample may belong to a tick half a tick before it was taken.
-        behind = math.floor(settings.window / self.dt + 0.5 + TOLERANCE) + 1
-        self._intake = Intake(
-            [layout.slice(name) for name in self.sensors],
-            training_ranges(primitive, settings.margin),
-            settings.start,
-            self.dt,
-            behind,
-            math.ceil(settings.longest_gap / self.dt),
-        )
-        self._slots = behind + 2
-        self._engine = make_engine(filter, layout.mask(self.sensors), layout.controlled, self._slots, settings.seed)
-        self._like = next(filter.parameters())
-        self._freshness = [self._intake.fresh() for _ in range(self._slots)]
-        self._engine.save(-1 % self._slots)
-        self._head, self._dirty, self._ticks = -1, 0, 0
-        self._now = self._newest = settings.start
+        self._timeline = Timeline(filter, primitive, self.sensors, settings)
+        self._longest = float((1 / primitive.phase_velocity).max())
         self._lock = threading.RLock()
         self._log: SessionLog | None = None
         if record is not None:
@@ -129,14 +112,10 @@ class InteractionSession:
         if number is None:
             raise ValueError(f"no sensor {sensor!r}; this session has {', '.join(self.sensors)}")
         with self._lock:
+            vector, moment = self._timeline.plain(number, values), as_number(time)
             if self._log is not None:
-                columns = self._intake.columns[number]
-                vector = as_vector(values, columns.stop - columns.start)
-                self._log.write(["push", sensor, as_number(time), None if vector is None else vector.tolist()])
-            tick = self._intake.put(number, values, time, self._head)
-            self._newest = max(self._newest, self._intake.reports[number].last)
-            if tick is not None:
-                self._dirty = min(self._dirty, tick)
+                self._log.write(["push", sensor, moment, None if vector is None else vector.tolist()])
+            self._timeline.push(number, vector, moment)
 
     @in_own_modes
     def advance(self, now: float | None = None) -> None:
@@ -150,34 +129,46 @@ class InteractionSession:
         """
         now = _plain(now)
         with self._lock:
-            self._advance(now)
+            self._timeline.advance(now)
             if self._log is not None:
                 self._log.write(["advance", now])
 
     @in_own_modes
-    def forecast(self, horizon: float | Sequence[float] | None = None, now: float | None = None) -> SessionForecast:
+    def forecast(
+        self,
+        horizon: float | Sequence[float] | None = None,
+        now: float | None = None,
+        *,
+        rate: float | None = None,
+    ) -> SessionForecast:
         """Filter up to the present, and say what the controlled DoFs should be.
 
         Args:
             horizon: seconds from now, one or several; default: the end of the interaction, phase 1. What lies
                 behind the end is the end.
             now: see `advance`.
+            rate: of the robot's controller, Hz: the way from now on, so many times a second, up to the horizon (one
+                number; default: the end, or the longest demonstration's duration if that is sooner).
 
         Raises:
-            ValueError: see `advance`; a horizon that is not finite.
+            ValueError: see `advance`; a horizon that is not finite; several of them with a rate; a rate that is not
+                positive, or asks for more than `MOST_POINTS`.
         """
         now = _plain(now)
         several = horizon is not None and np.ndim(horizon) > 0
         horizons = [] if horizon is None else np.atleast_1d(np.asarray(horizon, dtype=np.float64)).tolist()
         if not all(math.isfinite(h) for h in horizons):
             raise ValueError(f"horizons must be finite numbers of seconds, got {horizons}")
+        if rate is not None and several:
+            raise ValueError("a rate goes with one horizon, up to which the way is sampled, not with several")
         with self._lock:
-            self._advance(now)
-            phase, velocity = self._engine.clock()
-            # Since the last tick the interaction went on.
-            phase += velocity * (self._now - self._time(max(self._head, 0)))
+            self._timeline.advance(now)
+            phase, velocity = self._timeline.phase_now()
+            if rate is not None:
+                end = min((1 - min(phase, 1.0)) / velocity, self._longest) if velocity > 0 else self._longest
+                horizons, several, horizon = sampled(horizons[0] if horizons else end, rate), True, 0.0
             phases = [1.0] if horizon is None else [min(max(phase + velocity * h, 0.0), 1.0) for h in horizons]
-            expected = self._engine.forecast(self._like.new_tensor(phases))
+            expected = self._timeline.forecast(phases)
             mean, deviation = expected.mean, expected.variance.sqrt()
             if self._log is not None:
                 asked = horizons if several else horizons[0] if horizons else None
@@ -186,24 +177,25 @@ class InteractionSession:
                 mean, deviation = mean[0], deviation[0]
             phase = min(max(phase, 0.0), 1.0)
             left = (1 - phase) / velocity if velocity > 0 else math.inf
-            return SessionForecast(self._now, phase, left, self.dofs, mean, deviation, self._stale())
+            now, stale = self._timeline.now, tuple(self.sensors[i] for i in self._timeline.stale())
+            return SessionForecast(now, phase, left, self.dofs, mean, deviation, stale, tuple(horizons))
 
     @property
     def failed_updates(self) -> int:
         """How many ticks were left out because the filter could not take them in."""
         with self._lock:
-            return self._current().failed
+            return self._timeline.failed
 
     @property
     def ticks_filtered(self) -> int:
         """How many ticks the filter was led through so far, those that late samples made it repeat included."""
         with self._lock:
-            return self._ticks
+            return self._timeline.ticks
 
     def report(self) -> dict[str, SensorReport]:
         """What became of everything that was pushed, by sensor."""
         with self._lock:
-            return dict(zip(self.sensors, self._intake.report(self._current()), strict=True))
+            return dict(zip(self.sensors, self._timeline.report(), strict=True))
 
     def close(self) -> None:
         """End the recording, if there is one."""
@@ -214,7 +206,7 @@ class InteractionSession:
     def __repr__(self) -> str:
         return (
             f"InteractionSession({type(self._filter).__name__}, {', '.join(self.sensors)} -> {', '.join(self.dofs)}, "
-            f"at {self._now:g} s)"
+            f"{'not begun' if self._timeline.waiting else f'at {self._timeline.now:g} s'})"
         )
 
     def __enter__(self) -> InteractionSession:
@@ -224,62 +216,6 @@ class InteractionSession:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-    def _current(self) -> Freshness:
-        return self._freshness[self._head % self._slots]
-
-    def _time(self, tick: int) -> float:
-        return self.settings.start + tick * self.dt
-
-    def _stale(self) -> tuple[str, ...]:
-        oldest = self._now - self.settings.stale_after
-        used = self._current().used.tolist()
-        return tuple(
-            name for name, tick in zip(self.sensors, used, strict=True) if tick < 0 or self._time(tick) < oldest
-        )
-
-    def _advance(self, now: float | None) -> None:
-        if now is not None:
-            if not math.isfinite(now):
-                raise ValueError(f"now must be a finite time in seconds, got {now}")
-            gap = now - self._time(max(self._head, 0))
-            if gap > self.settings.longest_gap:
-                raise ValueError(
-                    f"now = {now} s is {gap:.1f} s after what was filtered last, more than the longest gap of "
-                    f"{self.settings.longest_gap} s; begin a new session"
-                )
-        self._now = max(self._now, self._newest if now is None else now)
-        newest = math.floor((self._now - self.settings.settle - self.settings.start) / self.dt + TOLERANCE)
-        if self._dirty <= self._head:
-            self._head = self._dirty - 1
-            self._engine.load(self._head % self._slots)
-        while self._head < newest:
-            self._step()
-        self._dirty = self._head + 1
-
-    def _step(self) -> None:
-        """One more tick."""
-        freshness = self._current().copy()
-        self._head += 1
-        self._ticks += 1
-        if self._head > 0:
-            self._engine.predict()
-        values, usable = self._intake.usable(self._head, freshness, self._patience)
-        if usable.any():
-            y = torch.as_tensor(values, dtype=self._like.dtype, device=self._like.device)
-            try:
-                self._engine.update(y, tuple(usable.tolist()))
-                done = self._engine.finite()
-            except ValueError:
-                done = False
-            if not done:
-                # Back to before the tick: this one is left out, as if nothing had been measured.
-                freshness.failed += 1
-                self._engine.load((self._head - 1) % self._slots)
-                if self._head > 0:
-                    self._engine.predict()
-        self._freshness[self._head % self._slots] = freshness
-        self._engine.save(self._head % self._slots)
 
 
 def _plain(now: float | None) -> float | None:

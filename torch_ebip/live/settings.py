@@ -9,6 +9,7 @@ from typing import Any
 
 from torch_ebip.common.arguments import as_count, as_number
 from torch_ebip.interaction.primitive import InteractionPrimitive
+from torch_ebip.live.opening import FIRST_SAMPLE
 
 FROZEN_AFTER = 0.25
 """Seconds: a sensor whose demonstrations never repeat themselves is frozen then."""
@@ -19,7 +20,8 @@ class SessionSettings:
     """How a session treats its sensors; times in seconds.
 
     Attributes:
-        start: time of phase 0 on the clock of all other times.
+        start: time of phase 0 on the clock of all other times; ``"first sample"``: the earliest time within
+            ``window`` of the first sample that arrives, whatever the order.
         window: by how much a sample may arrive late; later ones are dropped and counted.
         settle: for how long a tick waits for its samples before it is filtered. Sensors that arrive within it cost no
             replay; forecasts go on from the last tick at the speed of the interaction.
@@ -36,7 +38,7 @@ class SessionSettings:
         ValueError: a setting outside its range.
     """
 
-    start: float = 0.0
+    start: float | str = FIRST_SAMPLE
     window: float = 0.25
     settle: float = 0.0
     margin: float = 1.0
@@ -49,7 +51,10 @@ class SessionSettings:
         """Checks, and makes plain numbers of those of other libraries."""
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.name == "seed":
+            if field.name == "start" and isinstance(value, str):
+                if value != FIRST_SAMPLE:
+                    raise ValueError(f"start must be a time in seconds or {FIRST_SAMPLE!r}, got {value[:40]!r}")
+            elif field.name == "seed":
                 value = as_count("seed", value, -(2**63))
             elif isinstance(value, Mapping):
                 value = {
@@ -68,7 +73,7 @@ class SessionSettings:
             if number is None or not number > 0:
                 raise ValueError(f"{name} must be a positive number of seconds, got {number}")
         for name in ("start", "window", "longest_gap"):
-            if not math.isfinite(getattr(self, name)):
+            if getattr(self, name) != FIRST_SAMPLE and not math.isfinite(getattr(self, name)):
                 raise ValueError(f"{name} must be finite, got {getattr(self, name)}")
         if not self.margin >= 0:
             raise ValueError(f"margin must not be negative, got {self.margin}")
