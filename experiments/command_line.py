@@ -56,8 +56,28 @@ def experiment_parser(name: str, description: str | None) -> argparse.ArgumentPa
 
 def add_data_options(parser: argparse.ArgumentParser) -> None:
     """``--data`` and ``--demonstrations``."""
-    parser.add_argument("--data", metavar="FILE.npz", help="recordings in the project's format (default: simulated)")
+    parser.add_argument(
+        "--data", metavar="PATH", help="recordings: an .npz, or a folder of CSV files (default: simulated)"
+    )
     parser.add_argument("--demonstrations", type=int, default=221, metavar="N", help="simulated ones (default: 221)")
+
+
+def add_role_options(parser: argparse.ArgumentParser) -> None:
+    """``--sensors``, ``--targets``, ``--subsets``, ``--arm`` and ``--tip``."""
+    parser.add_argument(
+        "--sensors", nargs="+", metavar="NAME", help="with --data: modalities that are shown (default: all others)"
+    )
+    parser.add_argument(
+        "--targets", nargs="+", metavar="NAME", help="with --data: those to forecast (default: what is controlled)"
+    )
+    parser.add_argument(
+        "--subsets", nargs="+", default=[], metavar="SUBSET",
+        help="sensors shown together, modality names joined by +, or `all` (default: those of the paper, or all)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--arm", metavar="URDF", help="with --data: arm whose joints are a target, for the tool's loss"
+    )
+    parser.add_argument("--tip", metavar="LINK", help="link of the arm that carries the tool")
 
 
 def add_run_options(

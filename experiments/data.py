@@ -3,31 +3,64 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 from experiments.evaluate import Task
-from torch_ebip import Demonstrations, Layout
+from torch_ebip import Demonstrations, Layout, RobotArm
+from torch_ebip.learning.objective import joints_of
+from torch_ebip.learning.settings import settings_for
 
 FRACTIONS = (0.43, 0.82)
 """Shares of an interaction that the paper shows: before the ball is thrown, and on its way."""
-SAMPLES = 14
-"""How many samples of an interaction are used while tuning."""
 
 
-def load(data: str | None, count: int, seed: int) -> tuple[Demonstrations, Task]:
-    """Recordings and what is asked of them."""
+@dataclass(frozen=True)
+class Roles:
+    """What recordings of one's own are asked for, beside what they say themselves.
+
+    Attributes:
+        sensors, targets: names of modalities; None: as the recordings say.
+        arm: path of a URDF; None for no arm.
+        tip: link of it whose frame carries the tool.
+    """
+
+    sensors: tuple[str, ...] | None = None
+    targets: tuple[str, ...] | None = None
+    arm: str | None = None
+    tip: str | None = None
+
+
+def load(data: str | None, count: int, seed: int, roles: Roles | None = None) -> tuple[Demonstrations, Task]:
+    """Recordings and what is asked of them: a file, a folder of CSV files, or (None) the simulation."""
     if count < 1:
         raise SystemExit(f"--demonstrations must be at least 1, got {count}")
+    roles = Roles() if roles is None else roles
     if data is not None:
         try:
-            demonstrations = Demonstrations.load(data)
+            read = Demonstrations.load_folder if Path(data).is_dir() else Demonstrations.load
+            demonstrations = read(data)
+            given = demonstrations.layout
+            if roles.targets is None and not bool(given.controlled.any()):
+                raise ValueError(
+                    f"{data}: needs observed and controlled modalities, has {', '.join(given.names)}; say with "
+                    "--targets which are to be forecast"
+                )
+            demonstrations = demonstrations.assign(roles.targets, roles.sensors)
+            layout = demonstrations.layout
+            targets = [name for name in layout.names if name in (roles.targets or ()) or layout[name].controlled]
+            sensors = [name for name in layout.names if not layout[name].controlled]
+            arm = None
+            if roles.arm is not None:
+                if roles.tip is None:
+                    raise ValueError("--arm needs --tip, the link of it that carries the tool")
+                made = RobotArm(roles.arm, roles.tip)
+                arm = made, joints_of(made, layout, targets)[0]
         except (ValueError, OSError) as error:
             raise SystemExit(str(error)) from error
-        layout = demonstrations.layout
-        sensors = [modality.name for modality in layout.modalities if not modality.controlled]
-        targets = [modality.name for modality in layout.modalities if modality.controlled]
-        if not sensors or not targets:
-            raise SystemExit(f"{data}: needs observed and controlled modalities, has {', '.join(layout.names)}")
-        return demonstrations, Task({"all": sensors}, FRACTIONS, [], targets, {}, None)
+        return demonstrations, Task({"all": sensors}, FRACTIONS, [], targets, {}, arm)
+    if roles != Roles():
+        raise SystemExit("--sensors, --targets, --arm and --tip go with --data")
     from experiments.ball_catching import SUBSETS, load_or_generate, teacher
 
     task = Task(
@@ -64,4 +97,4 @@ def choose_subsets(task: Task, layout: Layout, asked: Sequence[str], alone: bool
 
 def thinning(demonstrations: Demonstrations) -> int:
     """Every how many samples suffice for tuning: neighbouring ones say nearly the same."""
-    return max(1, round(float(demonstrations.lengths.double().median()) / SAMPLES))
+    return settings_for(demonstrations, 1, 0, None, {}).thinning

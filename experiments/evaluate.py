@@ -14,6 +14,7 @@ from experiments.results import Cell, Values
 from torch_ebip import Demonstrations, Filter, Forecast, InteractionPrimitive, RobotArm
 from torch_ebip.common.draws import seeded
 from torch_ebip.learning import metrics as measure
+from torch_ebip.learning.references import ends, nearest
 
 
 class Task(NamedTuple):
@@ -101,7 +102,7 @@ class MeanMethod:
     """The mean of the training set, whatever is seen."""
 
     def __init__(self, primitive: InteractionPrimitive) -> None:
-        self.ends = _ends(copy.deepcopy(primitive).cpu())
+        self.ends = ends(copy.deepcopy(primitive).cpu())
 
     def __call__(self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor) -> Answer:
         """See `Method`."""
@@ -118,24 +119,12 @@ class NearestMethod:
 
     def __init__(self, primitive: InteractionPrimitive) -> None:
         self.primitive = copy.deepcopy(primitive).cpu()
-        self.ends = _ends(self.primitive)
+        self.ends = ends(self.primitive)
 
     def __call__(self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor) -> Answer:
         """See `Method`."""
         primitive = self.primitive
-        used = observed.any(0).any(0)
-        basis = primitive.basis.select(used)
-        weights = primitive.weights[:, used[primitive.basis.dof_of_weight()]]
-        phase = torch.arange(y.shape[1])[:, None] / primitive.rate * primitive.phase_velocity
-        variance = primitive.value_variance[used]
-        deviation = torch.where(variance > 0, variance, torch.inf).sqrt()
-        paths = basis.project(phase, weights) / deviation
-        chosen = torch.empty_like(keep)
-        for i in range(len(y)):
-            seen = observed[i][:, used]
-            values = torch.where(seen, y[i][:, used], 0) / deviation
-            squares = (torch.where(seen.unsqueeze(1), paths - values.unsqueeze(1), 0)).square().sum(-1)
-            chosen[i] = squares.cumsum(0)[keep[i]].argmin(-1)
+        chosen = nearest(primitive, y, observed, keep, 1 / primitive.rate)
         mean = self.ends[:, dofs][chosen]
         at = (keep / primitive.rate * primitive.phase_velocity[chosen]).to(y)
         return Answer(Forecast(mean, torch.full_like(mean, torch.nan), y.new_ones(keep.shape)), at)
@@ -203,19 +192,18 @@ def _metrics(
             found.append((Cell(subset, fraction, "crps", modality, unit), measure.crps(forecast, target)))
     if task.arm is not None:
         arm, modality = task.arm
-        part = layout.slice(modality)
-        columns = [order.index(dof) for dof in range(part.start, part.stop)]
-        distance = measure.tool_error(arm, answer.forecast.at(k).mean[..., columns], truth[:, part])
+        names = layout[modality].dofs
+        # By name where they have the arm's, as the loss takes them.
+        joints = arm.joint_names if set(arm.joint_names) <= set(names) else names
+        places = [layout.dofs.index(name) for name in joints]
+        columns = [order.index(dof) for dof in places]
+        distance = measure.tool_error(arm, answer.forecast.at(k).mean[..., columns], truth[:, places])
         found.append((Cell(subset, fraction, "tool_error", None, "m"), distance))
     if not answer.phase.isnan().any():
         found.append(
             (Cell(subset, fraction, "phase_error", None, "1"), measure.phase_error(answer.phase[:, k], phase))
         )
     return found
-
-
-def _ends(primitive: InteractionPrimitive) -> Tensor:
-    return primitive.basis.project(torch.ones(len(primitive)), primitive.weights)
 
 
 def last_measured(trajectory: Tensor) -> Tensor:

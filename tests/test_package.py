@@ -32,7 +32,7 @@ def test_every_public_name_is_there() -> None:
         assert getattr(torch_ebip, name).__doc__, name
 
 
-FLOORS = ("common", "kinematics", "recordings", "filtering", "interaction", "learning", "live")
+FLOORS = ("common", "kinematics", "recordings", "filtering", "interaction", "live", "learning")
 """From the ground up; `docs/architecture.md` has them in this order."""
 
 
