@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -27,9 +26,9 @@ from experiments.entries import METHODS, Fold
 from experiments.evaluate import FilterMethod, evaluate
 from experiments.figures import colour, plain
 from experiments.folds import mean_of_cells, split
-from experiments.methods import FACTORS, best_factor, scaled
 from experiments.run_folder import RunFolder, save_figure
 from torch_ebip import Filter, TuningSettings, ebip
+from torch_ebip.learning.starts import scaled
 
 FRACTION = 0.82
 
@@ -124,7 +123,7 @@ def main(arguments: list[str] | None = None) -> None:
     known, tests = demonstrations.subset(training), demonstrations.subset(testing)
     tuning = TuningSettings(seed=options.seed, thinning=thinning(demonstrations))
     fold = Fold.of(known, task, options.seed, tuning, run.path, scan=8 if options.quick else 48)
-    primitive = fold.problem.primitive
+    primitive = fold.primitive
     subset, names = list(task.subsets.items())[-1]
     shown = demonstrations.layout.mask(names)
     longest = int(demonstrations.lengths.argmax())
@@ -137,7 +136,7 @@ def main(arguments: list[str] | None = None) -> None:
     by_length = time_by_length(
         filters, demonstrations[longest], shown, lengths[:2] if options.quick else lengths, repeats
     )
-    factor = best_factor(fold.problem, scaled, tuning, fold.scan, FACTORS, Path(run.path) / "scan_scaled.json")
+    factor = fold.factor()
     sizes = [e for e in (10, 20, 40, 80, 120, 160, 198) if e < len(primitive)] + [len(primitive)]
     y = demonstrations[longest][: lengths[-1]]
     steps = {e: filtering(ebip(primitive, e), y, shown & ~y.isnan()) for e in sizes}

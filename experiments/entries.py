@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import torch
@@ -17,27 +17,29 @@ from experiments.baselines import (
     TreesMethod,
 )
 from experiments.evaluate import FilterMethod, MeanMethod, Method, NearestMethod, Task
-from experiments.methods import (
-    FACTORS,
-    Problem,
-    best_factor,
-    best_start,
-    particle_tunable,
-    scaled,
-    tunable,
-    tune,
-)
 from torch_ebip import (
+    BSplineBasis,
     Demonstrations,
     Filter,
+    ForecastObjective,
+    ForwardKinematicsLoss,
+    InteractionModel,
     InteractionPrimitive,
+    ParticleFilter,
+    Tuner,
     TuningSettings,
     bip,
     ebip,
     ebip_minus,
+    learn,
     particle_filter,
     select_basis,
 )
+from torch_ebip.learning import Weights
+from torch_ebip.learning.configuration import Task as Tuned
+from torch_ebip.learning.held_out import HeldOut
+from torch_ebip.learning.ranks import Ranks
+from torch_ebip.learning.starts import FACTORS, best_factor, scaled
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,8 @@ class Fold:
     """The training part of a fold.
 
     Attributes:
-        problem: demonstrations, primitive, targets.
+        known: the demonstrations.
+        primitive: of them.
         task: what will be asked.
         members: E; None: as many as there are demonstrations.
         seed: of everything random.
@@ -54,7 +57,8 @@ class Fold:
         folder: for checkpoints and records.
     """
 
-    problem: Problem
+    known: Demonstrations
+    primitive: InteractionPrimitive
     task: Task
     members: int | None
     seed: int
@@ -75,17 +79,65 @@ class Fold:
         device: torch.device | None = None,
     ) -> Fold:
         """Basis by BIC and the primitive of the training demonstrations, and what is tuned for."""
-        layout = known.layout
         primitive = InteractionPrimitive.fit(known, select_basis(known)).to(device)
-        subsets = {subset: layout.mask(names) for subset, names in task.subsets.items()}
-        arm = None if task.arm is None else (task.arm[0], layout.mask([task.arm[1]]))
-        problem = Problem(known, primitive, layout.mask(task.targets), subsets, arm)
-        return cls(problem, task, members, seed, scan, tuning, folder)
+        return cls(known, primitive, task, members, seed, scan, tuning, folder)
 
     @property
     def n_members(self) -> int:
         """E."""
-        return len(self.problem.primitive) if self.members is None else self.members
+        return len(self.primitive) if self.members is None else self.members
+
+    def tuned(self) -> Tuned:
+        """What a filter is tuned for that `learn` does not make: as `learn` has it."""
+        layout, device = self.primitive.layout, self.primitive.weights.device
+        targets = layout.mask(self.task.targets).to(device)
+        subsets = {subset: layout.mask(names).to(device) for subset, names in self.task.subsets.items()}
+        if self.task.arm is None:
+            return Tuned(self.primitive, ForecastObjective(self.primitive, targets), targets, subsets)
+        arm, joints = self.task.arm
+        loss = ForwardKinematicsLoss(arm, rotation_weight=0.1)
+        objective = ForecastObjective(
+            self.primitive, targets, weights=Weights(tool=1.0), arm=loss, arm_dofs=layout.mask([joints]).to(device)
+        )
+        return Tuned(self.primitive, objective, targets, subsets)
+
+    def held_out(self) -> HeldOut:
+        """Its interactions, each filtered by others."""
+        return HeldOut(self.known, self.tuned(), self.tuning)
+
+    def factor(self) -> float:
+        """The best one on R; found once, also for what is tuned."""
+        return best_factor(
+            self.held_out(), scaled, self.scan, FACTORS, self.folder / "ebip_tuned" / "scan_scaled.json"
+        )
+
+    def model(self) -> InteractionModel:
+        """What `learn` makes of it."""
+        layout, task = self.known.layout, self.task
+        settings = {field.name: getattr(self.tuning, field.name) for field in fields(self.tuning)}
+        model = learn(
+            self.known,
+            targets=task.targets,
+            sensors=[name for name in layout.names if name not in task.targets or name in _shown(task)],
+            subsets=task.subsets,
+            folder=self.folder / "ebip_tuned",
+            progress=lambda _: None,
+            arm=None if task.arm is None else task.arm[0],
+            joints=None if task.arm is None else task.arm[1],
+            basis=self.primitive.basis,
+            scan=self.scan,
+            members=settings.pop("n_members"),
+            ranks=Ranks(device=self.primitive.weights.device),
+            **settings,
+        )
+        if model.report["interrupted"]:
+            raise KeyboardInterrupt
+        return model if self.members is None else model.rebuilt(self.members)
+
+
+def _shown(task: Task) -> set[str]:
+    """Names of the modalities in any of its subsets."""
+    return {name for names in task.subsets.values() for name in names}
 
 
 def _filter(build: Callable[[Fold], Filter]) -> Callable[[Fold], Method | None]:
@@ -96,59 +148,60 @@ def _ebip_minus(fold: Fold) -> Filter:
     with warnings.catch_warnings():
         # That no mixture fits is a finding of the paper, and says so once a fold.
         warnings.filterwarnings("ignore", message="no mixture of up to")
-        return ebip_minus(fold.problem.primitive, fold.n_members, seed=fold.seed)
-
-
-def _factor(fold: Fold) -> float:
-    return best_factor(fold.problem, scaled, fold.tuning, fold.scan, FACTORS, fold.folder / "scan_scaled.json")
+        return ebip_minus(fold.primitive, fold.n_members, seed=fold.seed)
 
 
 def _ebip_scaled(fold: Fold) -> Filter:
-    return scaled(fold.problem.primitive, _factor(fold), fold.members)
+    return scaled(fold.primitive, fold.factor(), fold.members)
 
 
-def _ebip_tuned(fold: Fold) -> Filter:
-    record = fold.folder / "scan_tunable.json"
-    start = best_start(fold.problem, fold.tuning, fold.scan, _factor(fold), record)
-    filter = tunable(fold.problem.primitive, start, fold.members)
-    tune(fold.problem, filter, fold.tuning, None, fold.folder / "ebip_tuned.pt", None)
-    return filter
+def particle_tunable(primitive: InteractionPrimitive, factor: float, members: int | None = None) -> ParticleFilter:
+    """A particle filter to be tuned: R depends on phase, particles move a little, gradients pass resampling."""
+    return particle_filter(
+        primitive,
+        members,
+        residual_variance=factor * primitive.residual_variance,
+        weight_noise=0.05,
+        context=BSplineBasis(4),
+        softness=0.1,
+    )
 
 
 def _particle_filter_tuned(fold: Fold) -> Filter:
     record = fold.folder / "scan_particle.json"
-    start = best_factor(fold.problem, particle_tunable, fold.tuning, fold.scan, FACTORS, record)
-    filter = particle_tunable(fold.problem.primitive, start, fold.members)
-    tune(fold.problem, filter, fold.tuning, None, fold.folder / "particle_filter_tuned.pt", None)
+    start = best_factor(fold.held_out(), particle_tunable, fold.scan, FACTORS, record)
+    filter = particle_tunable(fold.primitive, start, fold.members)
+    checkpoint = fold.folder / "particle_filter_tuned.pt"
+    result = Tuner(filter, fold.known, *fold.tuned(), fold.tuning, checkpoint=checkpoint).run()
+    if result.interrupted_at is not None:
+        raise KeyboardInterrupt
     return filter
 
 
 def _ballistic(fold: Fold) -> Method | None:
     """None where nothing is thrown."""
-    return BallisticMethod(fold.problem.demonstrations) if "ball" in fold.task.targets else None
+    return BallisticMethod(fold.known) if "ball" in fold.task.targets else None
 
 
 def _gru(fold: Fold) -> Method:
-    problem = fold.problem
-    settings = RecurrentSettings(seed=fold.seed)
-    return RecurrentMethod(problem.demonstrations, problem.targets, problem.subsets, settings)
+    tuned, settings = fold.tuned(), RecurrentSettings(seed=fold.seed)
+    targets, subsets = tuned.targets.cpu(), {name: mask.cpu() for name, mask in tuned.subsets.items()}
+    return RecurrentMethod(fold.known, targets, subsets, settings)
 
 
 METHODS: dict[str, Callable[[Fold], Method | None]] = {
-    "mean": lambda fold: MeanMethod(fold.problem.primitive),
-    "nearest": lambda fold: NearestMethod(fold.problem.primitive),
+    "mean": lambda fold: MeanMethod(fold.primitive),
+    "nearest": lambda fold: NearestMethod(fold.primitive),
     "ballistic": _ballistic,
-    "ridge": lambda fold: RidgeMethod(fold.problem.demonstrations, fold.problem.targets, fold.task.fractions),
-    "trees": lambda fold: TreesMethod(
-        fold.problem.demonstrations, fold.problem.targets, fold.task.fractions, seed=fold.seed
-    ),
+    "ridge": lambda fold: RidgeMethod(fold.known, fold.problem.targets, fold.task.fractions),
+    "trees": lambda fold: TreesMethod(fold.known, fold.problem.targets, fold.task.fractions, seed=fold.seed),
     "gru": _gru,
-    "bip": _filter(lambda fold: bip(fold.problem.primitive)),
-    "particle_filter": _filter(lambda fold: particle_filter(fold.problem.primitive, fold.members)),
+    "bip": _filter(lambda fold: bip(fold.primitive)),
+    "particle_filter": _filter(lambda fold: particle_filter(fold.primitive, fold.members)),
     "particle_filter_tuned": _filter(_particle_filter_tuned),
     "ebip_minus": _filter(_ebip_minus),
-    "ebip": _filter(lambda fold: ebip(fold.problem.primitive, fold.members)),
+    "ebip": _filter(lambda fold: ebip(fold.primitive, fold.members)),
     "ebip_scaled": _filter(_ebip_scaled),
-    "ebip_tuned": _filter(_ebip_tuned),
+    "ebip_tuned": _filter(lambda fold: fold.model().filter),
 }
 """Builders; one that does not apply to the recordings returns None."""

@@ -14,9 +14,8 @@ import os
 import time
 from pathlib import Path
 
-from tqdm import tqdm
-
 from experiments.ball_catching.scene.model import load_mujoco
+from experiments.bars import learning_bar
 from experiments.catch.controllers import LEAD
 from experiments.catch.jobs import METHODS, Plan, as_settings, run_all
 from experiments.catch.learning import learn
@@ -25,6 +24,7 @@ from experiments.catch.throws import LATENCY
 from experiments.command_line import add_run_options, command, experiment_parser
 from experiments.run_folder import RunFolder
 from torch_ebip.common.files import atomic_write, read_json
+from torch_ebip.learning.interaction_model import NAME
 
 GROUPS = {"imu": ("imu_acceleration", "imu_gyro"), "shoes": ("shoe_left", "shoe_right")}
 """Names of sensors that are one object, beside the single ones."""
@@ -50,12 +50,7 @@ def main(arguments: list[str] | None = None) -> None:
     run = RunFolder("catch", settings, options.out, options.force, arguments)
     plan = Plan(str(run.path), throws, demonstrations, options.seed, lead, options.arm, sensors, share)
     if options.filter is None:
-        with tqdm(total=steps, desc="tuning", unit="step", dynamic_ncols=True) as bar:
-
-            def show(step: int, loss: float, validation: float) -> None:
-                bar.set_postfix_str(f"train {loss:.3f}, validation {validation:.3f}", refresh=False)
-                bar.update(step - bar.n)
-
+        with learning_bar() as show:
             learn(run.path, demonstrations, options.seed, steps, show)
     for name, content in taken.items():
         with atomic_write(run.path / name) as file:
@@ -116,7 +111,7 @@ def _take(source: Path, plan: Plan) -> dict[str, bytes]:
     """The files of another run's tuned filter, which must have been tuned on the same demonstrations."""
     try:
         theirs = read_json(source / "config.json")["settings"]
-        content = {name: (source / name).read_bytes() for name in ("filter.pt", "report.json")}
+        content = {name: (source / name).read_bytes() for name in (NAME, "report.json")}
         there = theirs["demonstrations"], theirs["seed"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SystemExit(f"--filter {source}: no finished tuning of experiments.catch ({error})") from error

@@ -41,7 +41,9 @@ class SessionController:
     """Follows what a filter expects of the robot: the paper's eBIP, and what is compared with it."""
 
     def __init__(self, filter: Filter, primitive: InteractionPrimitive, seed: int, lead: float | None = LEAD) -> None:
-        self.session = InteractionSession(filter, primitive, settings=SessionSettings(settle=SETTLE, seed=seed))
+        self.session = InteractionSession(
+            filter, primitive, settings=SessionSettings(start=0.0, settle=SETTLE, seed=seed)
+        )
         self.lead = lead
         self.seconds: list[float] = []
 

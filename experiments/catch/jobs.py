@@ -98,7 +98,7 @@ class Bench:
             return ReactiveController(self.reach, self.liked, self.plan.limits)
         if method not in self._filters:
             folder = Path(self.plan.folder)
-            factor = read_json(folder / "report.json")["factor_scaled"]
+            factor = read_json(folder / "report.json")["factor"]
             self._filters[method] = filters(folder, self.primitive, factor)[method]()
         seed = 1000 * self.plan.seed + toss.number
         return SessionController(self._filters[method], self.primitive, seed, self.plan.lead)

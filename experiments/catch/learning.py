@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from experiments import methods
-from experiments.data import load, thinning
-from experiments.methods import Problem, restore, scaled
-from torch_ebip import Filter, InteractionPrimitive, TuningSettings, ebip, particle_filter, select_basis
+import torch_ebip
+from experiments.data import load
+from torch_ebip import Filter, InteractionPrimitive, ebip, load_model, particle_filter, select_basis
+from torch_ebip.learning import Progress
+from torch_ebip.learning.starts import scaled
 
 MEMBERS = 80
 """Of an ensemble at work (the paper, section V)."""
@@ -27,27 +28,39 @@ def learn(
     demonstrations: int,
     seed: int,
     steps: int,
-    progress: Callable[[int, float, float], None] | None,
+    progress: Callable[[Progress], None] | None,
     scan: int = 48,
 ) -> None:
-    """Tune a filter of 80 members for all sensors together, on all demonstrations; what is finished is kept.
+    """Learn a model of 80 members for all sensors together, of all demonstrations; what is finished is kept.
 
     Args:
-        folder: gets the filter, its report, checkpoints and TensorBoard's data.
+        folder: gets the model, its report, checkpoints and TensorBoard's data.
         demonstrations: how many, simulated from the seed.
         seed: of data and draws.
         steps: gradient steps at most.
-        progress: called with step, loss and validation.
+        progress: called with a `Progress`.
         scan: interactions that decide where tuning starts.
     """
     known, task = load(None, demonstrations, seed)
-    primitive = know(demonstrations, seed)
-    layout = known.layout
     assert task.arm is not None
-    arm = task.arm[0], layout.mask([task.arm[1]])
-    problem = Problem(known, primitive, layout.mask(task.targets), {"all": layout.mask(task.subsets["all"])}, arm)
-    settings = TuningSettings(seed=seed, steps=steps, thinning=thinning(known), n_members=MEMBERS, horizons=HORIZONS)
-    methods.learn(folder, problem, settings, scan, MEMBERS, progress)
+    sensors = task.subsets["all"]
+    model = torch_ebip.learn(
+        known,
+        targets=task.targets,
+        sensors=[name for name in known.layout.names if name not in task.targets or name in sensors],
+        subsets={"all": sensors},
+        steps=steps,
+        seed=seed,
+        folder=folder,
+        progress=progress,
+        members=MEMBERS,
+        arm=task.arm[0],
+        joints=task.arm[1],
+        scan=scan,
+        horizons=HORIZONS,
+    )
+    if model.report["interrupted"]:
+        raise KeyboardInterrupt
 
 
 def filters(folder: Path, primitive: InteractionPrimitive, factor: float) -> dict[str, Callable[[], Filter]]:
@@ -59,8 +72,8 @@ def filters(folder: Path, primitive: InteractionPrimitive, factor: float) -> dic
         factor: the best single factor on R (`report.json`).
     """
     return {
-        "ebip_tuned": lambda: restore(folder, primitive, MEMBERS),
-        "ebip_tuned_all": lambda: restore(folder, primitive),
+        "ebip_tuned": lambda: load_model(folder).rebuilt(MEMBERS).filter,
+        "ebip_tuned_all": lambda: load_model(folder).rebuilt(len(primitive)).filter,
         "ebip_scaled": lambda: scaled(primitive, factor, MEMBERS),
         "ebip": lambda: ebip(primitive, MEMBERS),
         "particle_filter": lambda: particle_filter(primitive, MEMBERS),

@@ -15,8 +15,7 @@ import time
 from dataclasses import replace
 from statistics import median
 
-from tqdm import tqdm
-
+from experiments.bars import learning_bar
 from experiments.command_line import add_data_options, add_run_options, command, experiment_parser
 from experiments.faults.faults import GROUPS
 from experiments.faults.jobs import ASKED, METHODS, PORTION, Job, Plan, Study, run_portion
@@ -50,12 +49,7 @@ def main(arguments: list[str] | None = None) -> None:
     study.plan = plan = replace(plan, folder=str(run.path))
     print(study.known)
     if any("tuned" in name for name in plan.methods):
-        with tqdm(total=steps, desc="tuning", unit="step", dynamic_ncols=True) as bar:
-
-            def show(step: int, loss: float, validation: float) -> None:
-                bar.set_postfix_str(f"train {loss:.3f}, validation {validation:.3f}", refresh=False)
-                bar.update(step - bar.n)
-
+        with learning_bar() as show:
             study.learn(steps, scan, show)
     total, target = len(study.tests), study.task.targets[0]
     jobs = [Job(plan, first, min(first + PORTION, total)) for first in range(0, total, PORTION)]

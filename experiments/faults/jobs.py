@@ -11,11 +11,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from experiments.data import load, thinning
+from experiments.data import load
 from experiments.evaluate import FilterMethod, Task, evaluate
 from experiments.faults.faults import Fault, catalogue, suffer
 from experiments.folds import read_values, split, write_values
-from experiments.methods import Problem, learn, restore
 from experiments.results import Cell, Values
 from torch_ebip import (
     Demonstrations,
@@ -24,18 +23,20 @@ from torch_ebip import (
     Huber,
     InteractionPrimitive,
     StudentT,
-    TuningSettings,
     bip,
     ebip,
+    learn,
+    load_model,
     particle_filter,
     select_basis,
 )
+from torch_ebip.learning import Progress
 
 METHODS: dict[str, Callable[[Path, InteractionPrimitive, int], Filter]] = {
-    "ebip_tuned": lambda folder, primitive, members: restore(folder, primitive, members),
-    "tuned_student": lambda folder, primitive, members: restore(folder, primitive, members, StudentT()),
-    "tuned_huber": lambda folder, primitive, members: restore(folder, primitive, members, Huber()),
-    "tuned_gate": lambda folder, primitive, members: restore(folder, primitive, members, Gate()),
+    "ebip_tuned": lambda folder, primitive, members: load_model(folder).rebuilt(members).filter,
+    "tuned_student": lambda folder, primitive, members: load_model(folder).rebuilt(members, StudentT()).filter,
+    "tuned_huber": lambda folder, primitive, members: load_model(folder).rebuilt(members, Huber()).filter,
+    "tuned_gate": lambda folder, primitive, members: load_model(folder).rebuilt(members, Gate()).filter,
     "ebip": lambda folder, primitive, members: ebip(primitive, members),
     "ebip_student": lambda folder, primitive, members: ebip(primitive, members, robust=StudentT()),
     "particle_filter": lambda folder, primitive, members: particle_filter(primitive, members),
@@ -107,16 +108,26 @@ class Study:
         chosen = self.plan.groups
         return [fault for fault in every if chosen is None or fault.group in chosen]
 
-    def learn(self, steps: int, scan: int, progress: Callable[[int, float, float], None] | None) -> None:
+    def learn(self, steps: int, scan: int, progress: Callable[[Progress], None] | None) -> None:
         """Tune the filter that is put to the test, for all of the paper's sets of sensors."""
-        layout, task = self.known.layout, self.whole
-        arm = None if task.arm is None else (task.arm[0], layout.mask([task.arm[1]]))
-        subsets = {name: layout.mask(names) for name, names in task.subsets.items()}
-        problem = Problem(self.known, self.primitive, layout.mask(task.targets), subsets, arm)
-        settings = TuningSettings(
-            seed=self.plan.seed, steps=steps, thinning=thinning(self.known), n_members=self.plan.members
+        task, layout = self.whole, self.known.layout
+        shown = {name for names in task.subsets.values() for name in names}
+        model = learn(
+            self.known,
+            targets=task.targets,
+            sensors=[name for name in layout.names if name not in task.targets or name in shown],
+            subsets=task.subsets,
+            steps=steps,
+            seed=self.plan.seed,
+            folder=self.plan.folder,
+            progress=progress,
+            members=self.plan.members,
+            arm=None if task.arm is None else task.arm[0],
+            joints=None if task.arm is None else task.arm[1],
+            scan=scan,
         )
-        learn(Path(self.plan.folder), problem, settings, scan, self.plan.members, progress)
+        if model.report["interrupted"]:
+            raise KeyboardInterrupt
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,6 @@ import torch
 from experiments.folds import write_values
 from experiments.results import Cell
 from torch_ebip import Filter, InteractionPrimitive, InteractionSession, SessionSettings
-from torch_ebip.common.files import write_json
 from torch_ebip.learning.checkpoint import save_checkpoint
 
 Generator = Callable[[Random, Path, bool], None]
@@ -296,18 +295,6 @@ def fold_values(random: Random, path: Path, valid: bool) -> None:
         entry = random.choice(content)
         _spoil(random, entry, ("subset", "values"))
         path.write_text(json.dumps(content))
-
-
-def run_report(random: Random, path: Path, valid: bool) -> None:
-    """What a run says of its tuned filter."""
-    content: dict[str, Any] = {name: random.choice((1, "a", None, [2.5])) for name in names(random, 3)}
-    content |= {
-        "factor_scaled": random.random(),
-        "start": {"sharpness": 10.0, "factor": 100.0},
-    }  # of the filter there
-    if not valid:
-        _spoil(random, random.choice((content, content["start"])), ("start", "factor", "sharpness"))
-    write_json(path, content) if valid else path.write_text(json.dumps(content))
 
 
 def _spoil(random: Random, entry: dict[str, Any], places: Sequence[str]) -> None:

@@ -16,15 +16,15 @@ import numpy as np
 import torch
 
 from experiments.folds import read_values, write_values
-from experiments.fuzz import generators, planted_archives, planted_texts
+from experiments.fuzz import generators, planted_archives, planted_models, planted_texts
 from experiments.fuzz.generators import Generator
 from experiments.fuzz.mutations import Mutation
 from experiments.fuzz.worker import Reader
-from experiments.methods import Start, keep, restore, tunable
 from experiments.results import Cell
 from torch_ebip import (
     BSplineBasis,
     Demonstrations,
+    InteractionModel,
     InteractionPrimitive,
     InteractionSession,
     Layout,
@@ -32,10 +32,11 @@ from torch_ebip import (
     RobotArm,
     StackedBasis,
     ebip,
+    load_model,
     replay,
 )
-from torch_ebip.common.files import write_json
 from torch_ebip.learning.checkpoint import load_checkpoint, save_checkpoint
+from torch_ebip.learning.starts import Start, tunable
 
 CONFIGURATION = {"seed": 1, "horizons": [0.2, 0.9], "start": {"factor": 10.0}}
 
@@ -188,27 +189,21 @@ def _read_values(folder: Path) -> Any:
         assert all(array.ndim == 1 and array.dtype == np.float64 for array in methods.values())
 
 
-def _make_filter(folder: Path) -> None:
-    start = Start(100.0, 10.0)
-    keep(folder, start, tunable(primitive(), start))
-    write_json(folder / "report.json", {"start": start._asdict(), "factor_scaled": 100.0})
+def _make_model(folder: Path) -> None:
+    known = primitive()
+    InteractionModel(tunable(known, Start(100.0, 10.0)), known).save(folder / "model.safetensors")
 
 
-def _generate_filter(random: Random, path: Path, valid: bool) -> None:
-    """A tuned filter with any parameters, beside a report that fits."""
-    start = Start(10 ** random.uniform(-3, 3), 10 ** random.uniform(-1, 2))
-    tuned = tunable(primitive(), start)
+def _read_model(folder: Path) -> Any:
+    model = load_model(folder / "model.safetensors")
+    assert all(bool(parameter.isfinite().all()) for parameter in model.filter.parameters())
+    assert model.filter.dof_names == model.layout.dofs
+    assert 0 < model.rate < math.inf
     with torch.no_grad():
-        for parameter in tuned.parameters():
-            parameter.uniform_(-2, 2, generator=torch.Generator().manual_seed(random.getrandbits(32)))
-    keep(path.parent, start, tuned)
-    told = start._asdict() if valid else Start(start.factor * 2, start.sharpness)._asdict()
-    write_json(path.parent / "report.json", {"start": told, "factor_scaled": 100.0})
-
-
-def _read_filter(folder: Path) -> Any:
-    restored = restore(folder, primitive())
-    assert all(bool(parameter.isfinite().all()) for parameter in restored.parameters())
+        state = model.filter.initial_state(generator=torch.Generator().manual_seed(0))
+        assert bool(model.filter.forecast(state, torch.ones(1)).mean.isfinite().all())
+    tensors = [tensor.numpy().tobytes() for tensor in model.filter.state_dict().values()]
+    return hash((str(model), model.layout, tuple(tensors)))
 
 
 KINDS: dict[str, Kind] = {
@@ -256,14 +251,13 @@ KINDS: dict[str, Kind] = {
         Kind(
             "fold values", "values.json", _make_values, _read_values, planted_texts.run_json, generators.fold_values
         ),
-        Kind("run report", "report.json", _make_filter, _read_filter, planted_texts.run_json, generators.run_report),
         Kind(
-            "tuned filter",
-            "filter.pt",
-            _make_filter,
-            _read_filter,
-            planted_archives.checkpoint,
-            _generate_filter,
+            "model",
+            "model.safetensors",
+            _make_model,
+            _read_model,
+            planted_models.model,
+            planted_models.generate,
             exact=True,
         ),
     )

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from experiments.methods import Start, tunable
 from experiments.soak.stream import Sample
 from torch_ebip import (
     BSplineBasis,
@@ -21,6 +20,7 @@ from torch_ebip import (
     ebip,
     particle_filter,
 )
+from torch_ebip.learning.starts import Start, tunable
 
 START = Start(factor=100.0, sharpness=10.0)
 """About where tuning starts on the simulated task: R times 100."""

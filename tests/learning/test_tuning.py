@@ -108,7 +108,7 @@ def test_the_gradient_of_a_step_is_that_of_finite_differences() -> None:
     def loss() -> torch.Tensor:
         generator = torch.Generator().manual_seed(0)
         members = tuner.partition.members(torch.arange(4), generator)
-        trial = tuner.held_out.filter(made, torch.arange(4), SUBSETS["both"], shares, members, 0)
+        trial = tuner.held_out.filter(made, tuner.held_out.show(torch.arange(4), SUBSETS["both"], shares, members), 0)
         return torch.stack(list(trial.terms(objective).values())).sum()
 
     loss().backward()
@@ -212,8 +212,8 @@ def test_horizons_stay_inside_however_coarse_the_thinning(tmp_path: Path) -> Non
     made, tuner = filter_and_tuner(TuningSettings(folds=4, thinning=10, horizons=(0.9, 1.0)))
     shares = torch.tensor([[0.97, 1.0]]).expand(24, 2)
     members = tuner.partition.members(torch.arange(24), torch.Generator())
-    trial = tuner.held_out.filter(made, torch.arange(24), SUBSETS["both"], shares, members, 0)
-    assert trial.now.max() <= 1
+    trial = tuner.held_out.filter(made, tuner.held_out.show(torch.arange(24), SUBSETS["both"], shares, members), 0)
+    assert trial.shown.now.max() <= 1
     assert trial.trace.kept is not None
 
 

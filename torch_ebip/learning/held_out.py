@@ -7,7 +7,7 @@ the search for where it starts, and every score that is reported come from here.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import torch
@@ -29,43 +29,56 @@ PORTION = 64
 """Interactions that are filtered at once where none needs a gradient: more would only take memory."""
 
 
-class Trial(NamedTuple):
-    """B interactions as a filter saw them, up to K horizons each.
+class Shown(NamedTuple):
+    """B interactions as they are shown, up to K horizons each.
 
     Attributes:
-        filter: of the DoFs that are shown or asked for.
-        trace: with the states at the horizons.
+        interactions: int64 [B], which demonstrations they are.
+        members: int64 [B, E], the demonstrations of each one's ensemble.
+        dofs: bool [D], the D' that are shown or asked for.
         y: [B, T, D'], what was measured, NaN included.
-        observed: bool [B, T, D'], what of it was shown.
+        observed: bool [B, T, D'], what of it is shown.
         steps: int64 [B, K], at which samples the horizons are.
         now: [B, K], true phases of the horizons.
         truth: [B, K, P, D_targets], regressions at the objective's phases ahead of them.
-        targets: bool [D'], those among the filter's DoFs.
-        members: int64 [B, E], the demonstrations of each ensemble.
-        interactions: int64 [B], which demonstrations were filtered.
+        targets: bool [D'], those among the D'.
     """
 
-    filter: InteractionFilter
-    trace: Trace
+    interactions: Tensor
+    members: Tensor
+    dofs: Tensor
     y: Tensor
     observed: Tensor
     steps: Tensor
     now: Tensor
     truth: Tensor
     targets: Tensor
-    members: Tensor
-    interactions: Tensor
+
+
+class Trial(NamedTuple):
+    """Interactions as a filter saw them.
+
+    Attributes:
+        shown: what was shown of them.
+        filter: of the DoFs that are shown or asked for.
+        trace: with the states at the horizons.
+    """
+
+    shown: Shown
+    filter: InteractionFilter
+    trace: Trace
 
     def terms(self, objective: ForecastObjective) -> dict[str, Tensor]:
         """The weighted terms of an objective by name."""
+        shown = self.shown
         terms: dict[str, Tensor] = objective(
-            self.filter, self.trace, self.observed, self.truth, self.now, self.targets
+            self.filter, self.trace, shown.observed, shown.truth, shown.now, shown.targets
         )
         return terms
 
     def forecast(self, phase: Tensor) -> Forecast:
         """Of the targets at phases [B, K, P], from the states at the horizons."""
-        return self.filter.forecast(self.trace.kept, phase).select(self.targets)
+        return self.filter.forecast(self.trace.kept, phase).select(self.shown.targets)
 
 
 class HeldOut:
@@ -94,33 +107,21 @@ class HeldOut:
         low, high = self.settings.horizons
         return low + (high - low) * (torch.arange(4, device="cpu") + 0.5) / 4
 
-    def filter(
-        self,
-        filter: InteractionFilter,
-        interactions: Tensor,
-        subset: Tensor,
-        shares: Tensor,
-        members: Tensor,
-        key: int,
-    ) -> Trial:
-        """Filter this process's part of some interactions.
+    def show(self, interactions: Tensor, subset: Tensor, shares: Tensor, members: Tensor) -> Shown:
+        """This process's part of some interactions.
 
         Args:
-            filter: over all DoFs.
             interactions: int64 [B].
             subset: bool [D], of sensors that are shown.
             shares: [B, K], up to which parts of their length.
             members: int64 [B, E], their ensembles.
-            key: of the draws, with the seed and the interaction.
         """
         task = self.task
         mine = slice(self.ranks.rank, None, self.ranks.size)
         interactions, shares, members = interactions[mine], shares[mine], members[mine]
-        draws = [seeded(self.settings.seed, key, interaction) for interaction in interactions.tolist()]
         kept_dofs = subset | task.targets
         stride, device = self.settings.thinning, self.lengths.device
         interactions, shares, members = interactions.to(device), shares.to(device), members.to(device)
-        part = filter.restrict(kept_dofs, stride)
         last = (self.lengths[interactions] - 1).unsqueeze(-1)
         steps = torch.minimum((shares * last / stride).round().long(), last // stride)
         length = int(steps.max()) + 1
@@ -128,13 +129,33 @@ class HeldOut:
         observed = self.observed[interactions, ::stride][:, :length][..., kept_dofs] & subset[kept_dofs]
         within = torch.arange(length, device=steps.device).view(1, -1, 1) <= steps.amax(-1).view(-1, 1, 1)
         observed = observed & within
-        state = part.initial_state((len(interactions),), members, draws)
-        segment = self.settings.segment if torch.is_grad_enabled() else None
-        trace = part(y, observed, state=state, generator=draws, keep=steps, segment=segment or None, project=False)
         now = (steps * stride / last).to(y)
         truth = self.truth(interactions, task.objective.phases_ahead(now))
         targets = task.targets[kept_dofs]
-        return Trial(part, trace, y, observed, steps, now, truth, targets, members, interactions)
+        return Shown(interactions, members, kept_dofs, y, observed, steps, now, truth, targets)
+
+    def filter(self, filter: InteractionFilter, shown: Shown, key: int) -> Trial:
+        """Filter what is shown of some interactions.
+
+        Args:
+            filter: over all DoFs.
+            shown: of them.
+            key: of the draws, with the seed and the interaction.
+        """
+        draws = [seeded(self.settings.seed, key, interaction) for interaction in shown.interactions.tolist()]
+        part = filter.restrict(shown.dofs, self.settings.thinning)
+        state = part.initial_state((len(shown.interactions),), shown.members, draws)
+        segment = self.settings.segment if torch.is_grad_enabled() else None
+        trace = part(
+            shown.y,
+            shown.observed,
+            state=state,
+            generator=draws,
+            keep=shown.steps,
+            segment=segment or None,
+            project=False,
+        )
+        return Trial(shown, part, trace)
 
     def truth(self, interactions: Tensor, phase: Tensor) -> Tensor:
         """[B, K, P, D_targets], of interactions int64 [B]: their regressions at phases [B, K, P]."""
@@ -142,13 +163,10 @@ class HeldOut:
         weights = primitive.weights[interactions, None, None, :]
         return primitive.basis.project(phase, weights)[..., self.task.targets]
 
-    def trials(
-        self, filter: InteractionFilter, interactions: Tensor, subset: Tensor, shares: Tensor | None = None
-    ) -> Iterator[Trial]:
-        """This process's part of some interactions, always at the same horizons and draws, a few at a time.
+    def portions(self, interactions: Tensor, subset: Tensor, shares: Tensor | None = None) -> Iterator[Shown]:
+        """This process's part of some interactions, always at the same horizons, a few at a time.
 
         Args:
-            filter: over all DoFs.
             interactions: int64 [B].
             subset: bool [D], of sensors that are shown.
             shares: [K], up to which parts of their length; default: `shares`.
@@ -159,12 +177,30 @@ class HeldOut:
         parts = zip(torch.split(interactions, portion), torch.split(members, portion), strict=True)
         for some, theirs in parts:
             if len(some) > self.ranks.rank:  # at the end fewer may be left than there are processes
-                yield self.filter(filter, some, subset, shares.expand(len(some), -1), theirs, -1)
+                yield self.show(some, subset, shares.expand(len(some), -1), theirs)
+
+    def trials(
+        self, filter: InteractionFilter, interactions: Tensor, subset: Tensor, shares: Tensor | None = None
+    ) -> Iterator[Trial]:
+        """What a filter over all DoFs makes of `portions`, always with the same draws.
+
+        Args:
+            filter: over all DoFs.
+            interactions: int64 [B].
+            subset: bool [D], of sensors that are shown.
+            shares: [K], up to which parts of their length; default: `shares`.
+        """
+        for shown in self.portions(interactions, subset, shares):
+            yield self.filter(filter, shown, -1)
 
     @without_autocast
     @torch.no_grad()
     def evaluate(
-        self, filter: InteractionFilter, interactions: Tensor | None = None, shares: Tensor | None = None
+        self,
+        filter: InteractionFilter,
+        interactions: Tensor | None = None,
+        shares: Tensor | None = None,
+        more: Callable[[Trial], dict[str, float]] | None = None,
     ) -> dict[str, float]:
         """Scores of a filter as it is, always at the same horizons and draws; nothing is reported or changed.
 
@@ -173,6 +209,7 @@ class HeldOut:
             interactions: int64 [B], which demonstrations; default: those kept for validation. Each is filtered
                 by an ensemble that does not contain it.
             shares: [K], of an interaction that are shown; default: `shares`.
+            more: further scores, means over the interactions of a trial.
 
         Returns:
             ``loss``, its terms, ``subset/NAME`` the loss of each subset, and ``spread`` and ``error`` of the
@@ -192,14 +229,17 @@ class HeldOut:
             for trial in self.trials(filter, interactions, subset, shares):
                 terms = {key: float(value) for key, value in trial.terms(objective).items()}
                 terms[f"subset/{name}"] = sum(terms.values())
-                squares = objective.spread_and_error(trial.filter, trial.trace, trial.truth, trial.targets).square()
-                terms["spread"], terms["error"] = squares.tolist()
-                for key, value in terms.items():
-                    sums[key] = sums.get(key, 0.0) + value * len(trial.observed)
+                shown = trial.shown
+                squares = objective.spread_and_error(trial.filter, trial.trace, shown.truth, shown.targets).square()
+                others = {"spread": float(squares[0]), "error": float(squares[1])}
+                others |= {} if more is None else {f"more/{key}": value for key, value in more(trial).items()}
+                for key, value in (terms | others).items():
+                    sums[key] = sums.get(key, 0.0) + value * len(shown.observed)
             means = self.ranks.mean({key: value / mine for key, value in sums.items()}, mine)
             for key, value in means.items():
                 totals.setdefault(key, []).append(value)
         overall = {key: sum(values) / len(values) for key, values in totals.items()}
         spread, error = math.sqrt(overall.pop("spread")), math.sqrt(overall.pop("error"))
-        loss = sum(value for key, value in overall.items() if not key.startswith("subset/"))
+        loss = sum(value for key, value in overall.items() if not key.startswith(("subset/", "more/")))
+        overall = {key.removeprefix("more/"): value for key, value in overall.items()}
         return {**overall, "loss": loss, "spread": spread, "error": error}

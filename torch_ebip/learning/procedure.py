@@ -36,7 +36,7 @@ from torch_ebip.recordings.demonstrations import Demonstrations
 
 FEWEST = 10
 """Demonstrations below which there is no gradient: those kept for validation would say nothing."""
-MOST = 200
+MOST = 100
 """Interactions that decide about shrinkage, at most."""
 RECORD = "learning.json"
 """Of what a folder's learning is one of."""
@@ -164,7 +164,7 @@ class Procedure:
         primitive, held_out, tick = self.primitive, self.held_out, self.reporter.tick
         self.reporter.stage("closed form")
         closed = scaled(primitive, 1.0, self.members)
-        mean, nearest = reference_scores(held_out, closed, self.scored)
+        mean, nearest = reference_scores(held_out, self.scored)
         self.scores |= {"mean": mean, "nearest": nearest}
         tick()
         self._stage("closed_form", closed)
@@ -216,12 +216,9 @@ class Procedure:
         filter = self.filters[chosen]
         if self.shrink and not interrupted:
             self.reporter.stage("shrinkage")
-            some = torch.arange(len(self.known), device="cpu")
-            if len(some) > MOST:
-                some = torch.randperm(len(some), generator=torch.Generator("cpu").manual_seed(self.settings.seed))[
-                    :MOST
-                ]
-            readout, shares, error = learn_shrinkage(self.held_out, filter, some)
+            partition = self.held_out.partition
+            some = torch.cat([partition.validating, partition.training])[: max(MOST, len(self.scored))]
+            readout, shares, error = learn_shrinkage(self.held_out, filter, some, self.scored)
             filter.readout = readout
             self.said["shrinkage"] = shares
             self.scores["shrinkage"] = {"error": error}

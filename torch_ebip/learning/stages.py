@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
@@ -24,52 +22,56 @@ Scores = dict[str, float]
 and, of filters, ``loss`` and ``coverage_95``."""
 
 
-@without_autocast
-@torch.no_grad()
 def score(held_out: HeldOut, filter: InteractionFilter, interactions: Tensor) -> Scores:
     """Scores of a filter on interactions int64 [B]."""
-    scores = _ends_scored(held_out, filter, interactions, _forecast_of_filter)
-    return {**held_out.evaluate(filter, interactions), **scores}
+
+    def more(trial: Trial) -> Scores:
+        """What the objective does not say."""
+        forecast = trial.forecast(trial.shown.now.new_ones(1)).at(0)
+        error = (forecast.mean - trial.shown.truth[..., -1, :]).abs()
+        inside = error <= Z95 * forecast.variance.sqrt()
+        return {**_by_modality(held_out, error), "coverage_95": float(inside.to(error).mean())}
+
+    return held_out.evaluate(filter, interactions, more=more)
 
 
 @without_autocast
 @torch.no_grad()
-def reference_scores(held_out: HeldOut, filter: InteractionFilter, interactions: Tensor) -> tuple[Scores, Scores]:
+def reference_scores(held_out: HeldOut, interactions: Tensor) -> tuple[Scores, Scores]:
     """Scores of the training mean and of the nearest demonstration, each among those of the same ensembles.
 
     Args:
         held_out: the demonstrations, and what is asked of them.
-        filter: any, for the sake of its ensembles.
         interactions: int64 [B].
     """
-    primitive, targets = held_out.task.primitive, held_out.task.targets
-    last = ends(primitive)[:, targets]
+    task = held_out.task
+    primitive, scale = task.primitive, task.objective.scale
+    last = ends(primitive)[:, task.targets]
     dt = held_out.settings.thinning / primitive.rate
-
-    def mean(trial: Trial) -> tuple[Tensor, Tensor | None]:
-        """The mean end of each ensemble."""
-        found = last[trial.members].mean(1, keepdim=True)
-        return found.expand(-1, trial.steps.shape[1], -1), None
-
-    def near(trial: Trial) -> tuple[Tensor, Tensor | None]:
-        """Where the nearest member's demonstration ended."""
-        names = primitive.layout.dofs
-        places = torch.tensor([names.index(name) for name in trial.filter.dof_names or names], device=last.device)
-        y = trial.y.new_full((*trial.y.shape[:2], len(names)), torch.nan)
-        observed = torch.zeros_like(y, dtype=torch.bool)
-        y[..., places], observed[..., places] = trial.y, trial.observed
-        return last[nearest(primitive, y, observed, trial.steps, dt, trial.members)], None
-
-    return (
-        _ends_scored(held_out, filter, interactions, mean),
-        _ends_scored(held_out, filter, interactions, near),
-    )
+    totals: tuple[Scores, Scores] = {}, {}
+    count = 0
+    for subset in task.subsets.values():
+        for shown in held_out.portions(interactions, subset):
+            y = shown.y.new_full((*shown.y.shape[:2], len(subset)), torch.nan)
+            observed = torch.zeros_like(y, dtype=torch.bool)
+            y[..., shown.dofs], observed[..., shown.dofs] = shown.y, shown.observed
+            mean = last[shown.members].mean(1, keepdim=True)
+            near = last[nearest(primitive, y, observed, shown.steps, dt, shown.members)]
+            for said, total in zip((mean, near), totals, strict=True):
+                error = said - shown.truth[..., -1, :]
+                values = {"error": float((error / scale).square().mean()), **_by_modality(held_out, error.abs())}
+                for key, value in values.items():
+                    total[key] = total.get(key, 0.0) + value * len(error)
+            count += len(y)
+    scores = [held_out.ranks.mean({key: value / count for key, value in t.items()}, count) for t in totals]
+    first, second = ({**each, "error": each["error"] ** 0.5} for each in scores)
+    return first, second
 
 
 @without_autocast
 @torch.no_grad()
 def learn_shrinkage(
-    held_out: HeldOut, filter: InteractionFilter, interactions: Tensor
+    held_out: HeldOut, filter: InteractionFilter, interactions: Tensor, scored: Tensor
 ) -> tuple[Shrinkage, dict[str, list[float]], float]:
     """How far towards the training mean forecasts are best drawn, by modality and lead: least squares in [0, 1].
 
@@ -79,6 +81,7 @@ def learn_shrinkage(
         held_out: the demonstrations, and what is asked of them.
         filter: whose forecasts are drawn; without a read-out.
         interactions: int64 [B], that decide.
+        scored: int64 [S], those among them whose error is told.
 
     Returns:
         The read-out; the shares by target, one for each of `LEADS`; and the root mean squared error of the end after
@@ -94,15 +97,16 @@ def learn_shrinkage(
     kept: list[tuple[Tensor, Tensor, Tensor]] = []
     for subset in task.subsets.values():
         for trial in held_out.trials(filter, interactions, subset):
-            part = trial.now.new_tensor(AHEAD)
-            phase = trial.now.unsqueeze(-1) + (1 - trial.now.unsqueeze(-1)) * part
-            weights = primitive.weights[trial.members].mean(1)[:, None, None, :]
+            shown = trial.shown
+            phase = shown.now.unsqueeze(-1) + (1 - shown.now.unsqueeze(-1)) * shown.now.new_tensor(AHEAD)
+            weights = primitive.weights[shown.members].mean(1)[:, None, None, :]
             mean = primitive.basis.project(phase, weights)[..., targets]
             towards = ((trial.forecast(phase).mean - mean) / scale).double()
-            wanted = ((held_out.truth(trial.interactions, phase) - mean) / scale).double()
+            wanted = ((held_out.truth(shown.interactions, phase) - mean) / scale).double()
             now = trial.filter.phase(trial.trace.kept).clamp(0, 1).unsqueeze(-1)
             basis = hats((phase - now).clamp(0, 1).double(), leads)
-            kept.append((basis[..., -1, :], towards[..., -1, :], wanted[..., -1, :]))
+            told = torch.isin(shown.interactions, scored.to(shown.interactions.device))
+            kept.append((basis[told, :, -1], towards[told, :, -1], wanted[told, :, -1]))
             for group in groups:
                 ours = modality == group
                 square = towards[..., ours].square().sum(-1)
@@ -118,11 +122,11 @@ def learn_shrinkage(
         found[primitive.layout.names[group]] = [round(float(value), 4) for value in best]
         share[primitive.layout.modality_of_dof.to(share.device) == group] = best.to(share)
     ours = share[targets].double()
-    squares = [(torch.einsum("bki,di->bkd", basis, ours) * f - y).square().mean() for basis, f, y in kept]
-    sizes = [len(basis) for basis, _, _ in kept]
-    total = sum(float(square) * size for square, size in zip(squares, sizes, strict=True)) / sum(sizes)
-    total = held_out.ranks.mean({"square": total}, sum(sizes))["square"]
-    return Shrinkage(share), found, total**0.5
+    basis, towards, wanted = (torch.cat(parts) for parts in zip(*kept, strict=True))
+    squares = (torch.einsum("bki,di->bkd", basis, ours) * towards - wanted).square().flatten()
+    sums = torch.stack([squares.sum(), squares.new_tensor(len(squares))])
+    held_out.ranks.add_up([sums])
+    return Shrinkage(share), found, float((sums[0] / sums[1]).sqrt())
 
 
 def _within(gram: Tensor, moment: Tensor, pull: float) -> Tensor:
@@ -138,36 +142,8 @@ def _within(gram: Tensor, moment: Tensor, pull: float) -> Tensor:
     return share
 
 
-def _forecast_of_filter(trial: Trial) -> tuple[Tensor, Tensor | None]:
-    """Mean and variance of the end."""
-    forecast = trial.forecast(trial.now.new_ones(1)).at(0)
-    return forecast.mean, forecast.variance
-
-
-def _ends_scored(
-    held_out: HeldOut,
-    filter: InteractionFilter,
-    interactions: Tensor,
-    say: Callable[[Trial], tuple[Tensor, Tensor | None]],
-) -> Scores:
-    """Scores of what is said of the ends, mean [B, K, D_targets] and perhaps a variance, over all sets of sensors."""
-    task = held_out.task
-    layout, scale = task.primitive.layout, task.objective.scale
-    modality = layout.modality_of_dof.to(task.targets.device)[task.targets]
-    totals: Scores = {}
-    count = 0
-    for subset in task.subsets.values():
-        for trial in held_out.trials(filter, interactions, subset):
-            mean, variance = say(trial)
-            error = mean - trial.truth[..., -1, :]
-            values = {"error": float((error / scale).square().mean())}
-            for group in sorted(set(modality.tolist())):
-                values[f"mae/{layout.names[group]}"] = float(error[..., modality == group].abs().mean())
-            if variance is not None:
-                inside = error.abs() <= Z95 * variance.sqrt()
-                values["coverage_95"] = float(inside.to(error).mean())
-            for key, value in values.items():
-                totals[key] = totals.get(key, 0.0) + value * len(error)
-            count += len(error)
-    means = held_out.ranks.mean({key: value / count for key, value in totals.items()}, count)
-    return {**means, "error": means["error"] ** 0.5}
+def _by_modality(held_out: HeldOut, error: Tensor) -> Scores:
+    """Means of absolute errors [..., D_targets] by target modality, in its unit."""
+    layout, targets = held_out.task.primitive.layout, held_out.task.targets
+    modality = layout.modality_of_dof.to(targets.device)[targets]
+    return {f"mae/{layout.names[m]}": float(error[..., modality == m].mean()) for m in sorted(set(modality.tolist()))}

@@ -147,16 +147,18 @@ class Tuner:
         picked = self.partition.training[picked]
         members = self.partition.members(picked, generator)
         shares = low + (high - low) * draws
-        trial = self.held_out.filter(self.filter, picked, self.subsets[name], shares, members, step)
+        trial = self.held_out.filter(
+            self.filter, self.held_out.show(picked, self.subsets[name], shares, members), step
+        )
         terms = trial.terms(self.objective)
         terms["pull"] = settings.pull * self._distance()
         optimizer.zero_grad(set_to_none=True)
-        weight = len(trial.observed) / len(picked)
+        weight = len(trial.shown.observed) / len(picked)
         (weight * torch.stack(list(terms.values())).sum()).backward()  # type: ignore[no-untyped-call]
         # The pull sees every parameter, so that all have a gradient.
         self.ranks.add_up([parameter.grad for parameter in self.parameters.values() if parameter.grad is not None])
         values = {key: float(value.detach()) for key, value in terms.items()}
-        values["samples"] = int(trial.observed.any(-1).sum()) / weight
+        values["samples"] = int(trial.shown.observed.any(-1).sum()) / weight
         values = self.ranks.mean(values, weight)
         samples = values.pop("samples")
         total = sum(values.values())
