@@ -21,8 +21,9 @@ from experiments.catch.learning import MEMBERS, filters, know, learn
 from experiments.catch.table import markdown, summarise
 from experiments.catch.throws import Toss, catchable, draw
 from experiments.catch.trial import Drop, run
-from experiments.methods import Start, keep, tunable
+from torch_ebip import InteractionModel
 from torch_ebip.common.files import write_json
+from torch_ebip.learning.starts import Start, tunable
 
 pytest.importorskip("mujoco")
 READY = np.array(HABITS[0].ready)
@@ -188,8 +189,9 @@ def test_the_table_against_formulas() -> None:
 def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What `learn` would leave, without the tuning."""
     folder, start = tmp_path_factory.mktemp("learned"), Start(300.0, 10.0)
-    keep(folder, start, tunable(know(100, 0), start, MEMBERS))
-    write_json(folder / "report.json", {"start": start._asdict(), "factor_scaled": 300.0})
+    known = know(100, 0)
+    InteractionModel(tunable(known, start, MEMBERS), known).save(folder / "model.safetensors")
+    write_json(folder / "report.json", {"factor": 300.0})
     write_json(folder / "config.json", {"settings": {"demonstrations": 100, "seed": 0}})
     return folder
 
@@ -264,11 +266,12 @@ def test_a_filter_of_other_demonstrations_is_refused(learned: Path, tmp_path: Pa
 
 
 def test_learning_leaves_a_tuned_filter_of_eighty(tmp_path: Path) -> None:
-    steps: list[int] = []
-    learn(tmp_path, 110, 0, 1, lambda step, loss, validation: steps.append(step), scan=4)
-    assert steps == [1]
+    stages: list[str] = []
+    learn(tmp_path, 110, 0, 1, lambda progress: stages.append(progress.stage), scan=4)
+    assert "gradient" in stages
     report = json.loads((tmp_path / "report.json").read_text())
-    filter = filters(tmp_path, know(110, 0), report["factor_scaled"])["ebip_tuned"]()
+    filter = filters(tmp_path, know(110, 0), report["factor"])["ebip_tuned"]()
     assert filter.n_members == MEMBERS
-    learn(tmp_path, 110, 0, 1, lambda step, loss, validation: steps.append(step))  # nothing left to do
-    assert steps == [1]
+    told = len(stages)
+    learn(tmp_path, 110, 0, 1, lambda progress: stages.append(progress.stage), scan=4)  # nothing left to do
+    assert len(stages) == told

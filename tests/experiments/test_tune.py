@@ -16,9 +16,19 @@ from experiments import tune
 from experiments.data import load
 from experiments.evaluate import FilterMethod, MeanMethod, NearestMethod, Task, evaluate
 from experiments.folds import split
-from experiments.methods import Problem, Start, best_factor, best_start, restore, scaled, tunable
 from tests.conftest import interactions, small_primitive
-from torch_ebip import BSplineBasis, Demonstrations, InteractionPrimitive, Layout, Modality, select_basis
+from torch_ebip import (
+    BSplineBasis,
+    Demonstrations,
+    InteractionPrimitive,
+    Layout,
+    Modality,
+    RobotArm,
+    load_model,
+    select_basis,
+)
+from torch_ebip.learning.starts import Start, scaled, tunable
+from torch_ebip.recordings import example
 
 SMALL = ["--steps", "3", "--quick", "--seed", "5"]
 
@@ -40,6 +50,7 @@ def finished(recordings: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_run_folder_is_complete(finished: Path) -> None:
     names = {path.name for path in finished.iterdir()}
     assert {"config.json", "results.json", "results.png", "forecasts.png", "noise.png", "checkpoint.pt"} <= names
+    assert {"model.safetensors", "report.json", "learning.json", "basis.txt"} <= names
     assert list((finished / "tensorboard").glob("events*"))
     results = json.loads((finished / "results.json").read_text())
     assert results["experiment"] == "tune"
@@ -55,11 +66,10 @@ def test_a_finished_run_stops(finished: Path, recordings: str) -> None:
         tune.main(["--data", recordings, *SMALL, "--out", str(finished)])
 
 
-def test_the_tuned_filter_can_be_restored(finished: Path, recordings: str) -> None:
+def test_a_run_folder_holds_the_model_of_its_table(finished: Path, recordings: str) -> None:
     demonstrations = Demonstrations.load(recordings)
-    training, testing = split(30, 1, 0, 5)
-    primitive = InteractionPrimitive.fit(demonstrations.subset(training))
-    method = FilterMethod(restore(finished, primitive), 5)
+    _, testing = split(30, 1, 0, 5)
+    method = FilterMethod(load_model(finished).filter, 5)
     task = Task({"all": ["hand", "gaze"]}, (0.43, 0.82), [], ["arm"], {}, None)
     values = evaluate(task, {"ebip_tuned": method}, demonstrations.subset(testing))
     rows = json.loads((finished / "results.json").read_text())["rows"]
@@ -152,36 +162,6 @@ def test_nearest_finds_the_same_interaction() -> None:
     assert np.median(mae["mean"]) > 0.2
 
 
-def test_the_best_factor_does_not_wander_when_asked_again(tmp_path: Path) -> None:
-    primitive, made = small_primitive(), interactions()
-    subsets = {"all": torch.tensor([True, True, True, False, False])}
-    problem = Problem(made, primitive, ~subsets["all"], subsets, None)
-    settings = tune.TuningSettings(folds=4, thinning=2)
-    answers = [best_factor(problem, scaled, settings, 8, [1.0, 10.0], tmp_path / "scan.json") for _ in range(3)]
-    assert len(set(answers)) == 1
-    losses = {float(k): v for k, v in json.loads((tmp_path / "scan.json").read_text()).items()}
-    assert len(losses) == 4
-    assert answers[0] == min(losses, key=lambda factor: losses[factor])
-
-
-def test_the_start_is_the_best_of_the_grid(tmp_path: Path) -> None:
-    made = interactions(30)
-    primitive = InteractionPrimitive.fit(made, select_basis(made, [BSplineBasis(6)]))
-    layout = made.layout
-    problem = Problem(made, primitive, layout.mask(["arm"]), {"all": layout.mask(["hand", "gaze"])}, None)
-    settings = tune.TuningSettings(folds=4, thinning=2)
-    start = best_start(problem, settings, 6, 100.0, tmp_path / "scan.json")
-    losses = json.loads((tmp_path / "scan.json").read_text())
-    assert len(losses) == 9
-    best = min(losses, key=lambda entry: entry["loss"])
-    assert start == Start(best["factor"], best["sharpness"])
-    filter = tunable(primitive, start)
-    assert filter.analysis.weighting.sharpness.value.item() == pytest.approx(start.sharpness)
-    ratio = filter.model.measurement_noise.variance.value / primitive.residual_variance
-    assert ratio.mean().item() == pytest.approx(start.factor, rel=1e-4)
-    assert best_start(problem, settings, 6, 100.0, tmp_path / "scan.json") == start
-
-
 def test_the_simulated_task_has_the_papers_nine_cells() -> None:
     demonstrations, task = load(None, 16, 0)
     primitive = InteractionPrimitive.fit(
@@ -221,19 +201,48 @@ def test_the_simulated_task_has_the_papers_nine_cells() -> None:
     np.testing.assert_allclose(values[tool]["ebip_tuned"], distance, rtol=1e-4)
 
 
-def test_tuning_through_the_arm_reaches_the_noise() -> None:
-    demonstrations, task = load(None, 16, 0)
-    primitive = InteractionPrimitive.fit(demonstrations, select_basis(demonstrations, [BSplineBasis(8)]))
-    layout = demonstrations.layout
-    subsets = {name: layout.mask(names) for name, names in task.subsets.items()}
-    problem = Problem(
-        demonstrations, primitive, layout.mask(task.targets), subsets, (task.arm[0], layout.mask(["robot"]))
-    )
-    filter = tunable(primitive, Start(100.0, 10.0))
-    settings = tune.TuningSettings(steps=2, batch_size=4, validate_every=1, folds=2)
-    result = tune.tune(problem, filter, settings, None, None, None)
-    assert set(result.validation) == {0, 1, 2}
-    assert problem.objective().weights.tool == 1.0
+def test_final_learns_from_all_recordings(recordings: str, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    tune.main(["--data", recordings, "--quick", "--steps", "1", "--final", "--out", str(out)])
+    assert len(load_model(out).primitive) == 24
+    model = load_model(out / "final")
+    assert len(model.primitive) == model.report["demonstrations"] == 30
+
+
+def test_a_folder_of_csv_with_an_arm_of_ones_own(tmp_path: Path) -> None:
+    """Roles are given, joints are taken by name in whatever order, the tool's error is in the table."""
+    made = example().subset(range(14))
+    data = tmp_path / "data"
+    data.mkdir()
+    order = [*range(5), 10, 9, 8, 7, 6, 5]
+    names = [made.layout.dofs[i] for i in order]
+    text = ['rate = 30.0', *(
+        f'[[modalities]]\nname = "{name}"\ndofs = {json.dumps(dofs)}\nunit = "{unit}"'
+        for name, dofs, unit in (("hand", names[:3], "m"), ("gaze", names[3:5], "rad"), ("robot", names[5:], "rad"))
+    )]  # fmt: skip
+    (data / "layout.toml").write_text("\n".join(text))
+    for i, trajectory in enumerate(made):
+        rows = [",".join(names), *(",".join(f"{v:.6f}" for v in row) for row in trajectory[:, order].tolist())]
+        (data / f"{i:02d}.csv").write_text("\n".join(rows))
+    urdf = Path(tune.__file__).parents[1] / "torch_ebip" / "kinematics" / "ur5.urdf"
+    arguments = ["--data", str(data), "--targets", "robot", "--sensors", "hand", "--steps", "1", "--quick"]
+    arguments += ["--arm", str(urdf), "--tip", "flange", "--members", "8", "--out", str(tmp_path / "run")]
+    tune.main(arguments)
+    results = json.loads((tmp_path / "run" / "results.json").read_text())
+    model = load_model(tmp_path / "run")
+    assert model.sensors == ("hand",)
+    assert model.layout.names == ("hand", "robot")
+    assert model.filter.n_members == 8
+    assert "tool" in model.report["stages"]["start"]
+    rows = [row for row in results["rows"] if row["metric"] == "tool_error"]
+    error = {(row["method"], row["observed"]): row["mean"] for row in rows}
+    training, testing = split(14, 1, 0, 0)
+    arm, joints = RobotArm.ur5(), made.layout.mask(["robot"])
+    ends = torch.stack([trajectory[-1, joints] for trajectory in made])
+    mean = InteractionPrimitive.fit(made.subset(training))
+    basis = mean.basis.project(torch.ones(len(mean)), mean.weights).mean(0)[joints]
+    there, here = arm(ends[testing])[:, :3, 3], arm(basis)[:3, 3]
+    assert error["mean", 0.82] == pytest.approx(float((there - here).norm(dim=-1).mean()), rel=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -243,6 +252,12 @@ def test_tuning_through_the_arm_reaches_the_noise() -> None:
         (["--folds", "31"], "--folds must be between 1 and the 30"),
         (["--folds", "0"], "--folds must be between"),
         (["--demonstrations", "0"], "--demonstrations must be at least 1"),
+        (["--members", "1"], "--members must be at least 2"),
+        (["--targets", "leg"], "no modality 'leg'"),
+        (["--sensors", "hand", "hand"], "sensors must be different names"),
+        (["--sensors", "hand", "--subsets", "gaze"], "'gaze' is no sensor"),
+        (["--arm", "nowhere.urdf", "--tip", "flange"], "nowhere.urdf"),
+        (["--arm", "x.urdf"], "--arm needs --tip"),
     ],
 )
 def test_bad_arguments_are_named(arguments: list[str], message: str, recordings: str, tmp_path: Path) -> None:
@@ -253,7 +268,7 @@ def test_bad_arguments_are_named(arguments: list[str], message: str, recordings:
 
 
 def test_too_few_recordings_are_refused_before_any_work(tmp_path: Path) -> None:
-    for count in (2, 6, 11):
+    for count in (2, 3):
         interactions(count).save(tmp_path / "few.npz")
         with pytest.raises(SystemExit, match=f"{count} demonstrations with . held out are too few"):
             tune.main(["--data", str(tmp_path / "few.npz"), "--out", str(tmp_path / "run")])

@@ -62,12 +62,7 @@ def complete(
         ValueError: parts that do not belong together.
     """
     if primitive is None:
-        basis, states = filter.basis_projection.basis, getattr(filter.prior, "states", None)
-        if states is not None:
-            moved = demonstrations.to(dtype=states.dtype, device=states.device)
-            primitive = InteractionPrimitive.fit(moved, basis).to(states)
-        else:
-            primitive = InteractionPrimitive.fit(demonstrations, basis)
+        primitive = _primitive_of(filter, demonstrations)
     check_parts(filter, demonstrations, primitive)
     layout, device = primitive.layout, primitive.weights.device
     if targets is None:
@@ -85,6 +80,18 @@ def complete(
         raise ValueError("subsets must be at least one set of sensors that are shown together")
     masks = {name: as_mask(f"subset {name!r}", subset, layout.n_dofs).to(device) for name, subset in subsets.items()}
     return Task(primitive, objective, targets, masks)
+
+
+def _primitive_of(filter: InteractionFilter, demonstrations: Demonstrations) -> InteractionPrimitive:
+    """The primitive that a filter's members are of, fitted again."""
+    states: Tensor = filter.prior.states[:, filter.phase_model.moving :]  # type: ignore[index]
+    moved = demonstrations.to(dtype=states.dtype, device=states.device)
+    primitive = InteractionPrimitive.fit(moved, filter.basis_projection.basis)
+    # The filter's basis is in its own precision, so that a fit in float64 differs by rounding.
+    spread = states.std(0).clamp(min=torch.finfo(states.dtype).tiny)
+    if primitive.weights.shape == states.shape and bool(((primitive.weights - states).abs() <= 1e-3 * spread).all()):
+        primitive.weights.copy_(states)
+    return primitive
 
 
 def configuration(tuner: Tuner) -> dict[str, Any]:

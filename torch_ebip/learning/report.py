@@ -82,9 +82,9 @@ def verdict_of(stages: Mapping[str, Mapping[str, float]], chosen: str, interacti
     """
     last = stages.get("shrinkage", stages[chosen])["error"]
     mean, nearest = stages["mean"]["error"], stages["nearest"]["error"]
-    if last < 0.99 * min(mean, nearest):
+    if last < 0.95 * min(mean, nearest):
         said = "better than both"
-    elif last < 0.99 * mean:
+    elif last < 0.95 * mean:
         said = "better than the training mean, not than the nearest demonstration"
     else:
         said = "no better than the training mean: these sensors tell too little about the end, or there are too few"

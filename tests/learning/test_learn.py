@@ -1,0 +1,293 @@
+"""The recipe: what it returns, on how little it works, how it goes on, and what it refuses."""
+
+import json
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.conftest import interactions, small_primitive
+from torch_ebip import (
+    Demonstrations,
+    InteractionPrimitive,
+    Layout,
+    Modality,
+    RobotArm,
+    Tuner,
+    TuningSettings,
+    ebip,
+    learn,
+    select_basis,
+)
+from torch_ebip.learning.configuration import Task
+from torch_ebip.learning.held_out import HeldOut
+from torch_ebip.learning.objective import ForecastObjective
+from torch_ebip.learning.references import nearest
+from torch_ebip.learning.stages import learn_shrinkage, reference_scores, score
+from torch_ebip.learning.starts import FACTORS, best_factor, best_start, scaled, tunable
+from torch_ebip.recordings import example
+
+QUICK = {"steps": 4, "scan": 6, "batch_size": 4, "validate_every": 2}
+
+
+@pytest.fixture(scope="module")
+def model():
+    return learn(interactions(20), **QUICK)
+
+
+def test_it_is_the_recipe_step_by_step() -> None:
+    """What `experiments/methods.py` did, written out again with the parts that it was made of."""
+    known = interactions(20)
+    model = learn(known, shrink=False, **QUICK)
+    primitive = InteractionPrimitive.fit(known, select_basis(known))
+    targets = known.layout.controlled
+    task = Task(primitive, ForecastObjective(primitive, targets), targets, {"all": ~targets})
+    settings = TuningSettings(steps=4, batch_size=4, validate_every=2, thinning=3)
+    assert settings.thinning == model.report["settings"]["settings"]["thinning"]
+    held_out = HeldOut(known, task, settings)
+    factor = best_factor(held_out, scaled, 6, FACTORS)
+    start = best_start(held_out, factor, 6)
+    filter = tunable(primitive, start)
+    result = Tuner(filter, known, *task, settings).run()
+    assert model.report["factor"] == factor
+    assert model.report["start"] == start._asdict()
+    assert model.report["validation"] == {str(step): loss for step, loss in result.validation.items()}
+    losses = {name: scores["loss"] for name, scores in model.report["stages"].items() if "loss" in scores}
+    assert model.report["chosen"] == min(losses, key=losses.get)
+    assert losses["gradient"] == pytest.approx(min(result.validation.values()), rel=1e-6)
+    if model.report["chosen"] in ("start", "gradient"):
+        expected = filter if model.report["chosen"] == "gradient" else tunable(primitive, start)
+        for name, parameter in expected.named_parameters():
+            torch.testing.assert_close(dict(model.filter.named_parameters())[name], parameter)
+
+
+def test_references_against_plain_numpy() -> None:
+    """The mean of the other folds' ends, and the nearest of the other folds' demonstrations."""
+    known = interactions(12, dtype=torch.float64)
+    primitive = InteractionPrimitive.fit(known)
+    targets = known.layout.controlled
+    task = Task(primitive, ForecastObjective(primitive, targets), targets, {"all": ~targets})
+    held_out = HeldOut(known, task, TuningSettings(folds=3, thinning=1))
+    some = torch.arange(12)
+    mean, near = reference_scores(held_out, some)
+    ends = primitive.basis.project(torch.ones(12, dtype=torch.float64), primitive.weights)[:, targets].numpy()
+    scale = task.objective.scale.numpy()
+    members = held_out.partition.members(some, torch.Generator()).numpy()
+    assert all(i not in members[i] for i in range(12))
+    errors = np.stack([(ends[members[i]].mean(0) - ends[i]) / scale for i in range(12)])
+    assert mean["error"] == pytest.approx(np.sqrt((errors**2).mean()))
+    squares = []
+    deviation = primitive.value_variance.sqrt().numpy()
+    for i in range(12):
+        for share in held_out.shares.tolist():
+            last = round(share * (len(known[i]) - 1))
+            distances = []
+            for j in members[i]:
+                phase = torch.arange(last + 1, dtype=torch.float64) / known.rate * primitive.phase_velocity[j]
+                path = primitive.basis.project(phase, primitive.weights[j].expand(last + 1, -1)).numpy()
+                gap = ((path - known[i][: last + 1].numpy()) / deviation)[:, ~targets.numpy()]
+                distances.append(np.nansum(gap**2))
+            squares.append(((ends[members[i][np.argmin(distances)]] - ends[i]) / scale) ** 2)
+    assert near["error"] == pytest.approx(np.sqrt(np.mean(squares)))
+    assert nearest(
+        primitive, known.pad()[0], known.pad()[1], (known.lengths - 1).unsqueeze(-1), 1 / known.rate
+    ).flatten().tolist() == list(range(12))
+
+
+def test_shrinkage_finds_what_sensors_do_not_tell() -> None:
+    """A filter that sees noise only is drawn to the mean; one that sees the goal is left alone."""
+    draws = torch.Generator().manual_seed(0)
+    noise = Modality("noise", [f"n.{i}" for i in range(4)], "m")
+    layout = Layout([noise, Modality("hand", ["h"], "m"), Modality("arm", ["a"], "rad", controlled=True)])
+    paths = []
+    for _ in range(40):
+        phase, goal = torch.linspace(0, 1, 40).unsqueeze(-1), torch.randn((), generator=draws)
+        drift = torch.randn(4, generator=draws) * phase + torch.randn(4, generator=draws) * phase**2
+        path = torch.cat([drift, goal * phase, goal * phase**2], -1)
+        paths.append(path + 0.01 * torch.randn(path.shape, generator=draws))
+    known = Demonstrations(layout, paths, 20.0)
+    primitive = InteractionPrimitive.fit(known)
+    targets = layout.controlled
+    some = torch.arange(40)
+    found = {}
+    for sensor in ("noise", "hand"):
+        task = Task(primitive, ForecastObjective(primitive, targets), targets, {sensor: layout.mask([sensor])})
+        held_out = HeldOut(known, task, TuningSettings(thinning=2))
+        filter = ebip(primitive, square_root=True, residual_variance=primitive.residual_variance)
+        readout, shares, error = learn_shrinkage(held_out, filter, some, some)
+        mean, _ = reference_scores(held_out, some)
+        before = score(held_out, filter, some)["error"]
+        assert error <= before + 1e-6
+        assert error <= 1.05 * mean["error"]
+        found[sensor] = float(readout.share[-1, -2])
+        assert readout.share[:5].eq(1).all()
+        assert list(shares) == ["arm"]
+    assert found["noise"] < 0.3
+    assert found["hand"] > 0.8
+
+
+@pytest.mark.parametrize("count", [3, 4, 7])
+def test_few_demonstrations_give_a_model_without_a_gradient(count: int) -> None:
+    model = learn(example().subset(range(count)), scan=count)
+    report = model.report
+    assert "gradient" not in report["stages"]
+    assert f"no gradient: {count} demonstrations are too few" in report.verdict
+    assert report["interactions"] == count
+    assert set(report["stages"]) == {"mean", "nearest", "closed_form", "factor", "start", "shrinkage"}
+    losses = {name: scores["loss"] for name, scores in report["stages"].items() if "loss" in scores}
+    assert report["chosen"] == min(losses, key=losses.get)
+    assert model.forecast(example()[8], [0.5]).mean.isfinite().all()
+
+
+def test_ten_demonstrations_are_tuned_with_a_stronger_pull() -> None:
+    model = learn(interactions(10), **QUICK)
+    settings = model.report["settings"]["settings"]
+    assert "gradient" in model.report["stages"]
+    assert settings["pull"] == pytest.approx(0.04)
+    assert settings["folds"] == 5
+
+
+def test_roles_are_chosen_and_the_rest_is_left_out() -> None:
+    known = interactions(8)
+    model = learn(known, targets=["gaze"], sensors=["hand"], scan=4)
+    assert model.layout.names == ("hand", "gaze")
+    assert model.layout["gaze"].controlled
+    assert (model.targets, model.sensors) == (("gaze",), ("hand",))
+    both = learn(known, targets=["arm", "gaze"], sensors=["hand", "gaze"], scan=4)
+    assert both.sensors == ("hand", "gaze")
+    assert both.targets == ("arm", "gaze")
+
+
+def test_a_folder_goes_on_and_is_of_one_learning(tmp_path: Path) -> None:
+    known = interactions(20)
+    model = learn(known, folder=tmp_path, **QUICK)
+    assert {"learning.json", "report.json", "model.safetensors", "checkpoint.pt", "basis.txt"} <= {
+        path.name for path in tmp_path.iterdir()
+    }
+    assert list((tmp_path / "tensorboard").glob("events*"))
+    told: list[str] = []
+    again = learn(known, folder=tmp_path, progress=lambda progress: told.append(progress.stage), **QUICK)
+    assert not told
+    assert torch.equal(again.forecast(known[0], [0.3]).mean, model.forecast(known[0], [0.3]).mean)
+    for options, named in (({**QUICK, "seed": 3}, "settings"), ({**QUICK, "targets": ["gaze"]}, "columns")):
+        with pytest.raises(ValueError, match=f"another learning's folder: {named}"):
+            learn(known, folder=tmp_path, **options)
+    (tmp_path / "model.safetensors").unlink()
+    resumed = learn(known, folder=tmp_path, **QUICK)  # from the checkpoint
+    assert torch.equal(resumed.forecast(known[0], [0.3]).mean, model.forecast(known[0], [0.3]).mean)
+
+
+def test_progress_counts_to_the_end_and_never_back() -> None:
+    seen = []
+    learn(interactions(12), progress=seen.append, **QUICK)
+    done = [progress.done for progress in seen]
+    assert done == sorted(done)
+    assert seen[-1].done == seen[-1].total
+    assert [*dict.fromkeys(progress.stage for progress in seen)] == [
+        "closed form", "factor", "start", "gradient", "shrinkage"
+    ]  # fmt: skip
+    assert any("validation" in progress.text for progress in seen)
+
+
+@pytest.mark.parametrize("stage", ["factor", "gradient"])
+def test_an_interrupt_keeps_the_best_so_far(stage: str, tmp_path: Path) -> None:
+    """A signal as Ctrl-C sends it, in the middle of a stage; the folder then goes on to what a whole run gives."""
+    known = interactions(20)
+    sent = []
+
+    def stop(progress) -> None:
+        if progress.stage == stage and not sent and (stage != "gradient" or "validation" in progress.text):
+            sent.append(progress)
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.05)
+
+    assert threading.current_thread() is threading.main_thread()
+    model = learn(known, folder=tmp_path, progress=stop, **QUICK)
+    assert sent
+    assert model.report["interrupted"]
+    assert "interrupted, this is the best so far" in model.report.verdict
+    assert model.forecast(known[0], [0.3]).mean.isfinite().all()
+    assert not (tmp_path / "model.safetensors").exists()
+    whole, resumed = learn(known, **QUICK), learn(known, folder=tmp_path, **QUICK)
+    assert not resumed.report["interrupted"]
+    assert torch.allclose(whole.forecast(known[0], [0.3]).mean, resumed.forecast(known[0], [0.3]).mean)
+
+
+def test_an_arm_is_part_of_what_is_minimised() -> None:
+    known = example().subset(range(8))
+    model = learn(known, arm=RobotArm.ur5(), scan=4)
+    assert "tool" in model.report["stages"]["start"]
+    assert "joints=shoulder_pan_joint" in model.report["settings"]["arm"]
+
+
+def still(known: Demonstrations) -> Demonstrations:
+    paths = [trajectory.clone() for trajectory in known]
+    for path in paths:
+        path[:, 4] = 0.5
+    return Demonstrations(known.layout, paths, known.rate)
+
+
+def degrees(known: Demonstrations) -> Demonstrations:
+    modalities = [
+        Modality(m.name, m.dofs, "deg" if m.controlled else m.unit, m.controlled) for m in known.layout.modalities
+    ]
+    return Demonstrations(Layout(modalities), list(known), known.rate)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: learn(interactions(2)), "at least 3 demonstrations, got 2"),
+        (lambda: learn(interactions(8), targets=["leg"]), "no modality 'leg'"),
+        (lambda: learn(interactions(8), sensors=[]), "no sensors"),
+        (lambda: learn(interactions(8), sensors="hand"), "different names"),
+        (lambda: learn(interactions(8), subsets={"a": ["arm"]}), "subsets name arm; the sensors are hand, gaze"),
+        (lambda: learn(interactions(8), pulll=1.0), "no setting pulll; there are batch_size"),
+        (lambda: learn(interactions(8), steps=-1), "steps must be at least 0"),
+        (lambda: learn(still(interactions(8))), r"end differently in different demonstrations, got \['arm.2'\]"),
+        (lambda: learn(interactions(8), arm=RobotArm.ur5()), "no target is the arm's 6 joints .*arm has 2 DoFs"),
+        (lambda: learn(degrees(example()), arm=RobotArm.ur5()), "'shoulder_pan_joint' is in 'rad', but .* 'deg'"),
+    ],
+)  # fmt: skip
+def test_mistakes_are_named_and_nothing_is_written(make, message: str, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=message):
+        make()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_seed_reproduces(model) -> None:
+    again = learn(interactions(20), **QUICK)
+    one, other = (each.report.plain() for each in (model, again))
+    for content in (one, other):
+        del content["seconds"]
+    assert json.dumps(one, sort_keys=True) == json.dumps(other, sort_keys=True)
+
+
+def test_a_report_is_a_table_with_a_verdict_and_cannot_be_changed(model) -> None:
+    text = str(model.report)
+    assert text.splitlines()[-1] == model.report.verdict
+    for stage in model.report["stages"]:
+        assert stage in text
+    model.report["stages"]["mean"]["error"] = 0.0
+    assert model.report["stages"]["mean"]["error"] > 0
+    with pytest.raises(TypeError):
+        model.report["verdict"] = "perfect"
+    json.dumps(model.report.plain(), allow_nan=False)
+
+
+def test_a_tuner_finds_out_itself_what_is_left_out() -> None:
+    primitive = small_primitive()
+    made = ebip(primitive, square_root=True)
+    tuner = Tuner(made, interactions(), settings=TuningSettings(steps=1, folds=4, thinning=4, batch_size=4))
+    assert tuner.targets.tolist() == [False, False, False, True, True]
+    assert {name: mask.tolist() for name, mask in tuner.subsets.items()} == {"all": [True, True, True, False, False]}
+    assert torch.equal(tuner.primitive.weights, primitive.weights)
+    assert tuner.run().validation
+    only = ForecastObjective(primitive, torch.tensor([False, False, False, True, False]))
+    assert Tuner(made, interactions(), objective=only).targets.tolist() == [False, False, False, True, False]

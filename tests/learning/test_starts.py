@@ -1,0 +1,44 @@
+"""Where the gradient starts: the best of a grid, found once."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.conftest import interactions, small_primitive
+from torch_ebip import BSplineBasis, ForecastObjective, InteractionPrimitive, TuningSettings, select_basis
+from torch_ebip.learning.configuration import Task
+from torch_ebip.learning.held_out import HeldOut
+from torch_ebip.learning.starts import Start, best_factor, best_start, scaled, tunable
+
+
+def test_the_best_factor_does_not_wander_when_asked_again(tmp_path: Path) -> None:
+    primitive, made = small_primitive(), interactions()
+    subsets = {"all": torch.tensor([True, True, True, False, False])}
+    task = Task(primitive, ForecastObjective(primitive, ~subsets["all"]), ~subsets["all"], subsets)
+    held_out = HeldOut(made, task, TuningSettings(folds=4, thinning=2))
+    answers = [best_factor(held_out, scaled, 8, [1.0, 10.0], tmp_path / "scan.json") for _ in range(3)]
+    assert len(set(answers)) == 1
+    losses = {float(k): v for k, v in json.loads((tmp_path / "scan.json").read_text()).items()}
+    assert len(losses) == 4
+    assert answers[0] == min(losses, key=lambda factor: losses[factor])
+
+
+def test_the_start_is_the_best_of_the_grid(tmp_path: Path) -> None:
+    made = interactions(30)
+    primitive = InteractionPrimitive.fit(made, select_basis(made, [BSplineBasis(6)]))
+    layout = made.layout
+    targets = layout.mask(["arm"])
+    task = Task(primitive, ForecastObjective(primitive, targets), targets, {"all": ~targets})
+    held_out = HeldOut(made, task, TuningSettings(folds=4, thinning=2))
+    start = best_start(held_out, 100.0, 6, record=tmp_path / "scan.json")
+    losses = json.loads((tmp_path / "scan.json").read_text())
+    assert len(losses) == 9
+    best = min(losses, key=lambda entry: entry["loss"])
+    assert start == Start(best["factor"], best["sharpness"])
+    filter = tunable(primitive, start)
+    assert filter.analysis.weighting.sharpness.value.item() == pytest.approx(start.sharpness)
+    ratio = filter.model.measurement_noise.variance.value / primitive.residual_variance
+    assert ratio.mean().item() == pytest.approx(start.factor, rel=1e-4)
+    assert best_start(held_out, 100.0, 6, record=tmp_path / "scan.json") == start
