@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_ebip.common.arguments import as_mask
+from torch_ebip.common.brief import brief
 from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.learning.objective import ForecastObjective
@@ -46,6 +47,9 @@ class Task(NamedTuple):
     objective: ForecastObjective
     targets: Tensor
     subsets: Mapping[str, Tensor]
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 def complete(

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torch_ebip.common.ambient import without_autocast
+from torch_ebip.common.brief import brief
 from torch_ebip.common.draws import seeded
 from torch_ebip.filtering.trace import Trace
 from torch_ebip.interaction.filters import InteractionFilter
@@ -54,6 +55,9 @@ class Shown(NamedTuple):
     truth: Tensor
     targets: Tensor
 
+    def __repr__(self) -> str:
+        return brief(self)
+
 
 class Trial(NamedTuple):
     """Interactions as a filter saw them.
@@ -67,6 +71,9 @@ class Trial(NamedTuple):
     shown: Shown
     filter: InteractionFilter
     trace: Trace
+
+    def __repr__(self) -> str:
+        return brief(self)
 
     def terms(self, objective: ForecastObjective) -> dict[str, Tensor]:
         """The weighted terms of an objective by name."""

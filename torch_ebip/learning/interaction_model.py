@@ -210,7 +210,7 @@ class InteractionModel:
         """
         return forecast_recorded(self.filter, self.layout, values, ahead, seed)
 
-    def check(self, demonstrations: Demonstrations) -> Demonstrations:
+    def prepare(self, demonstrations: Demonstrations) -> Demonstrations:
         """Recordings as this model needs them, with its roles; what it does not need is left out.
 
         Raises:
@@ -223,13 +223,13 @@ class InteractionModel:
         """A model with more members: the same basis and noise, nothing is tuned again.
 
         Args:
-            demonstrations: at least one, of the same interaction; see `check`.
+            demonstrations: at least one, of the same interaction; see `prepare`.
 
         Raises:
-            ValueError: recordings that do not fit, see `check`; labels here and none there, or the other way round.
+            ValueError: recordings that do not fit, see `prepare`; labels here and none there, or the other way round.
         """
         mine = self.primitive
-        new = self.check(demonstrations).to(dtype=mine.weights.dtype, device=mine.weights.device)
+        new = self.prepare(demonstrations).to(dtype=mine.weights.dtype, device=mine.weights.device)
         if (new.labels is None) != (self.labels is None):
             raise ValueError("labels: the model and the recordings must both have them, or neither")
         primitive = mine.extend(new)

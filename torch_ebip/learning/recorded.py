@@ -37,7 +37,7 @@ def forecast_recorded(
     if y.ndim != 2 or y.shape[1] != layout.n_dofs or len(y) == 0:
         raise ValueError(
             f"values must be [T, {layout.n_dofs}], one column for each of {', '.join(layout.dofs[:8])}, "
-            f"got {list(y.shape)}"
+            f"got {list(y.shape)}; `InteractionModel.prepare` gives recordings the model's columns"
         )
     if len(ahead) == 0:
         raise ValueError("ahead must be at least one number of seconds")
