@@ -82,11 +82,13 @@ def constants_of(
     root: str, joints: Sequence[UrdfJoint], follows: Sequence[tuple[str, float, float]], free: Sequence[str]
 ) -> Chain:
     """The constants of a chain in float64, its frames by pytorch-kinematics."""
-    # Imported here: it pulls in matplotlib, which nobody without an arm should wait for.
-    from pytorch_kinematics import Transform3d
-    from pytorch_kinematics.chain import Chain as Tree
-    from pytorch_kinematics.chain import SerialChain
-    from pytorch_kinematics.frame import Frame, Joint, Link
+    try:  # imported here: it pulls in matplotlib, which nobody without an arm should wait for
+        from pytorch_kinematics import Transform3d
+        from pytorch_kinematics.chain import Chain as Tree
+        from pytorch_kinematics.chain import SerialChain
+        from pytorch_kinematics.frame import Frame, Joint, Link
+    except ImportError as error:
+        raise ImportError(f"arms need pytorch-kinematics: pip install pytorch-kinematics ({error})") from error
 
     first = Frame(root, Link(root), Joint(dtype=torch.float64))
     tip = first

@@ -27,9 +27,10 @@ class Monitor:
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
-        # Imported here: TensorBoard takes half a second that nobody should wait for who does not watch.
-        from torch.utils.tensorboard import SummaryWriter
-
+        try:  # imported here: it takes half a second that nobody should wait for who does not watch
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError as error:
+            raise ImportError(f"a monitor needs TensorBoard: pip install tensorboard ({error})") from error
         self.folder = str(folder)
         self._goes_on = any(Path(folder).glob("events.out.tfevents.*"))
         self._writer: Any = SummaryWriter(self.folder)
