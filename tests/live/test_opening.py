@@ -108,14 +108,61 @@ def test_a_clock_in_other_units_is_refused_with_a_guess(unit: str, many: float, 
         session.advance((epoch + 8 * DT) * many)
 
 
-def test_slow_sensors_and_pauses_are_not_taken_for_another_unit() -> None:
+@pytest.mark.parametrize("rate", [2.0, 5.0, 30.0, 60.0])
+@pytest.mark.parametrize("many", [1e3, 1e6, 1e9])
+def test_sensors_slower_or_faster_than_the_demonstrations_betray_the_unit_too(rate: float, many: float) -> None:
+    session = live()
+    for i in range(8):
+        session.push("hand", (0.1, 0.1 + 0.01 * i), (100.0 + i / rate) * many)
+    with pytest.raises(ValueError, match="times seem to be in"):
+        session.forecast(0.1)
+
+
+def test_slow_sensors_and_real_clocks_are_not_taken_for_another_unit() -> None:
     session = live(longest_gap=100.0)
     for i in range(12):
-        session.push("hand", (0.1, 0.1 + 0.01 * i), i * 60 * DT)  # one sample where demonstrations have sixty
+        session.push("hand", (0.1, 0.1 + 0.01 * i), 0.5 * i)
     assert math.isfinite(session.forecast(0.1).phase)
     session = live()
     pushed(session, samples(), time.time())
     assert math.isfinite(session.forecast(0.1).phase)
+
+
+def test_a_clock_gone_mad_does_not_silence_the_others() -> None:
+    """What one sensor says of the time is counted against it; the rest goes on as if it were not there."""
+    session, without = live(), live()
+    for sensor, value, moment in samples():
+        if sensor == "hand":
+            without.push(sensor, value, moment + 50.0)
+            session.push(sensor, value, moment + 50.0)
+            session.push("gaze", (0.1,), 1.7e18 + 1e6 * moment)
+            session.push("hand", None, 1e300)
+    one, other = session.forecast(0.1), without.forecast(0.1)
+    assert torch.equal(one.mean, other.mean)
+    assert "gaze" in one.stale
+    assert session.report()["gaze"].early > 10
+
+
+@pytest.mark.parametrize("first", [0.0, EPOCH + 3600.0])
+def test_a_first_time_that_is_wrong_is_forgotten(first: float) -> None:
+    """A header without a stamp, or one from the future: where the others agree, the interaction began."""
+    session, clean = live(), live()
+    session.push("hand", (0.1, 0.1), first)
+    session.forecast()
+    pushed(session, samples(), EPOCH)
+    pushed(clean, samples(), EPOCH)
+    assert same(everything(session, EPOCH + 0.8), everything(clean, EPOCH + 0.8))
+
+
+def test_one_wrong_time_later_on_changes_nothing() -> None:
+    session, clean = live(), live()
+    stream = samples()
+    pushed(session, stream[:12], EPOCH)
+    for _ in range(20):
+        session.push("hand", (0.1, 0.1), 0.0)
+    pushed(session, stream[12:], EPOCH)
+    pushed(clean, stream, EPOCH)
+    assert same(everything(session, EPOCH + 0.8), everything(clean, EPOCH + 0.8))
 
 
 def test_the_way_is_sampled_at_the_rate_of_a_controller() -> None:

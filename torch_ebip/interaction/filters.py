@@ -75,6 +75,7 @@ class InteractionFilter(Filter):
     def _check(self) -> None:
         """See `Filter._check`."""
         self.readout = None
+        self._spread: tuple[Tensor, int, Tensor, list[Tensor]] | None = None
         model = self.model
         if not isinstance(model.dynamics, PhaseModel) or not isinstance(model.measurement, BasisProjection):
             raise ValueError(
@@ -134,8 +135,8 @@ class InteractionFilter(Filter):
         Args:
             state: of this filter.
             phase: [P] or [..., P], or one number; default: 50 phases evenly from the current one to 1.
-            ahead: instead of phases: seconds, [P] or one number, each member at its own velocity; infinity, and
-                what lies behind the end, is the end. `Forecast.phase` is then the mean of the members'.
+            ahead: instead of phases: seconds, [P] or one number, each member at its own velocity, backwards none;
+                infinity, and what lies behind the end, is the end. `Forecast.phase` is then the mean of the members'.
 
         Raises:
             ValueError: phases that are NaN or infinite; seconds that are NaN or negative; both.
@@ -163,10 +164,15 @@ class InteractionFilter(Filter):
 
     def demonstrated(self, phase: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of the demonstrations at phases [..., P]: [..., P, D], units of the DoFs and squared."""
-        weights = self.prior.states[:, self.phase_model.moving :]  # type: ignore[index]
-        mean = weights.mean(0)
-        paths = self.basis_projection.basis.project_paths(phase.unsqueeze(-2), weights - mean)
-        return self.basis_projection.basis.project_paths(phase, mean), paths.var(-3)
+        states, basis = self.prior.states, self.basis_projection.basis
+        assert isinstance(states, Tensor)
+        version = 0 if states.is_inference() else states._version
+        if self._spread is None or self._spread[0] is not states or self._spread[1] != version:
+            # Kept: otherwise every forecast on a robot would cost a look at all demonstrations.
+            weights = states[:, self.phase_model.moving :]
+            self._spread = states, version, weights.mean(0), basis.variances(weights)
+        _, _, mean, blocks = self._spread
+        return basis.project_paths(phase, mean), basis.project_variances(phase, blocks).clamp(min=0)
 
     def attribution(self, state: State) -> Tensor:
         """Which demonstrations speak: the mean forecast is this affine combination of their trajectories.
@@ -232,7 +238,8 @@ class InteractionMemberFilter(InteractionFilter, MemberFilter):
         moving = self.model.split(members)[0]
         now, velocity = moving[..., 0].unsqueeze(-2), self.phase_model.velocity(moving).unsqueeze(-2)
         end = ahead.isinf().unsqueeze(-1)
-        phase = now + velocity * torch.where(end, 0, ahead.unsqueeze(-1))
+        # A member that runs backwards, of a hand that goes back, waits: it has no end to come to.
+        phase = now + velocity.clamp(min=0) * torch.where(end, 0, ahead.unsqueeze(-1))
         phase = torch.where(end, 1, phase).clamp(max=1)
         departures = basis.project(phase, members[..., m:].unsqueeze(-3))
         weights = None if state.weights is None else state.weights.unsqueeze(-2)
@@ -273,7 +280,8 @@ class InteractionExtendedFilter(InteractionFilter, ExtendedFilter):
     def _forecast_ahead(self, state: GaussianState, ahead: Tensor) -> Forecast:
         """See `InteractionFilter._forecast_ahead`: at the mean velocity."""
         now, velocity = self.phase(state).unsqueeze(-1), self.phase_velocity(state).unsqueeze(-1)
-        phase = torch.where(ahead.isinf(), 1, now + velocity * torch.where(ahead.isinf(), 0, ahead)).clamp(max=1)
+        phase = torch.where(ahead.isinf(), 1, now + velocity.clamp(min=0) * torch.where(ahead.isinf(), 0, ahead))
+        phase = phase.clamp(max=1)
         return self._forecast(state, phase)
 
     def _forecast(self, state: GaussianState, phase: Tensor) -> Forecast:

@@ -148,7 +148,7 @@ def build_filter(primitive: InteractionPrimitive, description: Description) -> I
             share = primitive.weights.new_ones(primitive.layout.n_dofs, len(readout))
             filter.readout = Shrinkage(share, readout)
         return filter
-    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, ArithmeticError, LookupError, TypeError, ValueError) as error:
         raise ValueError(f"a description of no filter that `ebip` makes: {error}") from error
 
 

@@ -82,6 +82,11 @@ class InteractionModel:
             raise ValueError(
                 f"the filter takes {1 / self.filter.dt:g} samples a second, the primitive {self.primitive.rate:g}"
             )
+        dtypes = {tensor.dtype for tensor in (*self.filter.parameters(), self.filter.prior.states)}
+        if dtypes != {self.primitive.weights.dtype}:
+            raise ValueError(
+                f"filter and primitive must have one dtype, got {dtypes}, {self.primitive.weights.dtype}"
+            )
         states = self.filter.prior.states
         if not torch.equal(states[:, self.filter.phase_model.moving :], self.primitive.weights):  # type: ignore[index]
             raise ValueError("the filter's members are not the demonstrations of this primitive")
@@ -172,7 +177,7 @@ class InteractionModel:
                 tuple(description["targets"]),
                 None if labels is None else tuple(labels),
             )
-        except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        except (AttributeError, ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:
             raise ValueError(f"{path}: a model whose parts do not fit together: {error}") from error
 
     def session(

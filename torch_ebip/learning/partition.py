@@ -17,6 +17,7 @@ class Partition:
 
     Attributes:
         training, validating: int64, which demonstrations.
+        fold_of: int64 [N], in which fold each is.
 
     Raises:
         ValueError: fewer than two folds, or too few demonstrations for them: every fold needs one, and an ensemble of
@@ -34,12 +35,12 @@ class Partition:
         part[order] = torch.arange(count, device="cpu") % settings.folds
         groups = [(part != fold).nonzero().squeeze(-1) for fold in range(settings.folds)]
         size = min(len(group) for group in groups)
-        self._part, self._others = part, torch.stack([group[:size] for group in groups])
+        self.fold_of, self._others = part, torch.stack([group[:size] for group in groups])
         self._size = settings.n_members
 
     def members(self, interactions: Tensor, generator: torch.Generator) -> Tensor:
         """Indices [B, E] of demonstrations outside the fold of each of some interactions, int64 [B]."""
-        others, size = self._others[self._part[interactions]], self._size
+        others, size = self._others[self.fold_of[interactions]], self._size
         if size is None or size == others.shape[1]:
             return others
         if size > others.shape[1]:

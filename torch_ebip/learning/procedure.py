@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import platform
 import time
 from collections.abc import Mapping
@@ -29,7 +30,7 @@ from torch_ebip.learning.progress import Reporter
 from torch_ebip.learning.ranks import Ranks
 from torch_ebip.learning.report import STAGES, Report, verdict_of
 from torch_ebip.learning.settings import TuningSettings
-from torch_ebip.learning.stages import Scores, learn_shrinkage, reference_scores, score
+from torch_ebip.learning.stages import Drawn, Scores, learn_shrinkage, reference_scores, score
 from torch_ebip.learning.starts import FACTORS, SHARPNESSES, Start, best_factor, best_start, scaled, tunable
 from torch_ebip.learning.tuner import Tuner
 from torch_ebip.recordings.demonstrations import Demonstrations
@@ -40,6 +41,8 @@ MOST = 100
 """Interactions that decide about shrinkage, at most."""
 RECORD = "learning.json"
 """Of what a folder's learning is one of."""
+LEFT = ("checkpoint.pt", "report.json", "scan_scaled.json", "scan_tunable.json")
+"""What else a learning leaves there."""
 
 
 @dataclass
@@ -107,25 +110,33 @@ class Procedure:
                     f"{str(ours[differing[0]])[:200]} here"
                 )
         elif self.ranks.first:
+            there = [name for name in (NAME, *LEFT) if (place / name).exists()]
+            if there:
+                raise ValueError(
+                    f"{place}: holds {', '.join(there)}, but not {RECORD}: nothing says of which learning"
+                )
             write_json(record, ours)
             if self.ranking is not None:
                 with atomic_write(place / "basis.txt") as file:
                     file.write(f"{selection_table(self.ranking)}\n".encode())
         self.ranks.from_first(lambda: None)  # none goes on before the record is there
-        return InteractionModel.load(place / NAME) if (place / NAME).exists() else None
+        finished = record.exists() and (place / NAME).exists()
+        return InteractionModel.load(place / NAME) if finished else None
 
     def identity(self) -> dict[str, Any]:
         """Everything on which the result depends, as JSON gives it back."""
-        values = torch.cat([trajectory.double().nan_to_num().flatten() for trajectory in self.known])
         objective = self.task.objective
         return {
             "columns": self.primitive.meant(),
             "demonstrations": len(self.known),
-            "values": f"{float(values.square().mean().sqrt()):.6g}",
+            "values": fingerprint(self.known),
+            "labels": None if self.known.labels is None else list(self.known.labels),
+            "basis": str(self.primitive.basis),
             "targets": list(self.targets),
             "subsets": {name: list(names) for name, names in self.subsets.items()},
             "members": self.members,
-            "arm": None if objective.arm is None else objective.arm.arm.meant(),
+            "arm": None if objective.arm is None else f"{objective.arm}; {objective.arm.arm.meant()}",
+            "joints": objective.joints,
             "shrink": self.shrink,
             "scan": self.scan,
             "steps": self.steps,
@@ -152,7 +163,15 @@ class Procedure:
             if not self.filters:
                 raise
             interrupted = True
-        return self._finish(interrupted)
+        interrupted = interrupted or self.said.get("interrupted_at") is not None
+        chosen = min(self.filters, key=lambda name: self.scores[name]["loss"])
+        drawn = None
+        if not interrupted:
+            try:
+                drawn = self._draw(self.filters[chosen])
+            except KeyboardInterrupt:
+                interrupted = True
+        return self._finish(chosen, drawn, interrupted)
 
     @property
     def scored(self) -> Tensor:
@@ -201,44 +220,49 @@ class Procedure:
         checkpoint = None if self.place is None else self.place / "checkpoint.pt"
         tuner = Tuner(filter, self.known, *self.task, self.settings, self.monitor, checkpoint, show, self.ranks)
         result = tuner.run()
-        self.filters["gradient"] = filter
-        self.scores["gradient"] = score(self.held_out, filter, self.scored)
         self.said |= {
             "best_step": result.best_step,
             "stopped_early": result.stopped_early,
             "validation": {str(step): loss for step, loss in result.validation.items()},
             "interrupted_at": result.interrupted_at,
         }
+        self.scores["gradient"] = score(self.held_out, filter, self.scored)
+        self.filters["gradient"] = filter
 
-    def _finish(self, interrupted: bool) -> InteractionModel:
-        """Choose, draw towards the mean, report."""
-        chosen = min(self.filters, key=lambda name: self.scores[name]["loss"])
+    def _draw(self, filter: InteractionEnsembleFilter) -> Drawn:
+        """How far the forecasts of a filter are drawn towards the mean."""
+        self.reporter.stage("shrinkage")
+        # Those that are scored first: they are the beginning of the order.
+        partition = self.held_out.partition
+        some = torch.cat([partition.validating, partition.training])[: max(MOST, len(self.scored))]
+        drawn = learn_shrinkage(self.held_out, filter, some, self.scored)
+        if self.shrink:
+            filter.readout = drawn.readout
+            self.said["shrinkage"] = drawn.shares
+            self.scores["shrinkage"] = {"error": drawn.error}
+        self.reporter.tick()
+        return drawn
+
+    def _finish(self, chosen: str, drawn: Drawn | None, interrupted: bool) -> InteractionModel:
+        """Report and keep."""
         filter = self.filters[chosen]
-        if self.shrink and not interrupted:
-            self.reporter.stage("shrinkage")
-            partition = self.held_out.partition
-            some = torch.cat([partition.validating, partition.training])[: max(MOST, len(self.scored))]
-            readout, shares, error = learn_shrinkage(self.held_out, filter, some, self.scored)
-            filter.readout = readout
-            self.said["shrinkage"] = shares
-            self.scores["shrinkage"] = {"error": error}
-            self.reporter.tick()
         reason = None
-        if interrupted or self.said.get("interrupted_at") is not None:
+        if interrupted:
             reason = "interrupted, this is the best so far"
         elif self.steps and not self.tunes:
             reason = f"no gradient: {len(self.known)} demonstrations are too few to tell when to stop"
+        gain = None if drawn is None else drawn.gain if self.shrink else drawn.gain_alone
         names = [name for name in STAGES if name in self.scores]
         stages = {name: self.scores[name] for name in names}
         layout, basis = self.known.layout, self.primitive.basis
         report = Report(
             {
-                "verdict": verdict_of(stages, chosen, len(self.scored), reason),
+                "verdict": verdict_of(stages, chosen, len(self.scored), gain, reason),
                 "chosen": chosen,
                 "stages": stages,
                 "interactions": len(self.scored),
                 "demonstrations": len(self.known),
-                "interrupted": reason is not None and "interrupted" in reason,
+                "interrupted": interrupted,
                 **self.said,
                 "basis": {m.name: str(basis.bases[layout.slice(m.name).start]) for m in layout.modalities},
                 "n_weights": basis.n_weights,
@@ -256,3 +280,13 @@ class Procedure:
             write_json(self.place / "report.json", report.plain())
             model.save(self.place / NAME)
         return model
+
+
+def fingerprint(demonstrations: Demonstrations) -> str:
+    """Sixteen hexadecimal digits that change with any value, their order, their number or their kind."""
+    digest = hashlib.sha256()
+    for trajectory in demonstrations:
+        values = trajectory.detach().cpu().contiguous()
+        digest.update(f"{values.dtype} {list(values.shape)}".encode())
+        digest.update(values.nan_to_num(nan=1e30).numpy().tobytes())
+    return digest.hexdigest()[:16]

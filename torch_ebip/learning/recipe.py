@@ -91,12 +91,22 @@ def learn(
         raise ValueError(f"learning needs at least 3 demonstrations, got {len(demonstrations)}")
     as_count("steps", steps, 0)
     as_count("scan", scan)
+    targets, sensors = (None if names is None else _names(role, names) for role, names in
+                        (("targets", targets), ("sensors", sensors)))  # fmt: skip
     known = demonstrations.assign(targets, sensors)
     if targets is None:
         targets = [m.name for m in demonstrations.layout.modalities if m.controlled]
     if sensors is None:
         sensors = [name for name in demonstrations.layout.names if name not in targets]
-    shown = {"all": tuple(sensors)} if subsets is None else {name: tuple(names) for name, names in subsets.items()}
+    if subsets is not None and (not isinstance(subsets, Mapping) or not subsets):
+        raise ValueError(f"subsets must be names of modalities by the name of the set, got {str(subsets)[:80]}")
+    if joints is not None and arm is None:
+        raise ValueError(f"joints={joints!r} without an arm that they are of")
+    shown = (
+        {"all": tuple(sensors)}
+        if subsets is None
+        else {name: _names(f"subset {name!r}", names) for name, names in subsets.items()}
+    )
     strangers = {name for names in shown.values() for name in names} - set(sensors)
     if strangers:
         raise ValueError(f"subsets name {', '.join(sorted(strangers))}; the sensors are {', '.join(sensors)}")
@@ -115,3 +125,13 @@ def learn(
             return run.go(place, monitor, reporter)
     finally:
         reporter.close()
+
+
+def _names(role: str, names: Sequence[str]) -> tuple[str, ...]:
+    """Names of modalities, at least one."""
+    if isinstance(names, str) or not hasattr(names, "__iter__"):
+        raise ValueError(f"{role} must be different names of modalities, got {names!r}")
+    several = tuple(names)
+    if not several:
+        raise ValueError(f"no {role}: name at least one modality")
+    return several

@@ -39,6 +39,7 @@ def forecast_recorded(
             f"values must be [T, {layout.n_dofs}], one column for each of {', '.join(layout.dofs[:8])}, "
             f"got {list(y.shape)}; `InteractionModel.prepare` gives recordings the model's columns"
         )
+    ahead = [ahead] if isinstance(ahead, int | float) else list(ahead)
     if len(ahead) == 0:
         raise ValueError("ahead must be at least one number of seconds")
     observed = ~y.isnan() & ~layout.controlled.to(y.device)
@@ -52,7 +53,7 @@ def forecast_recorded(
         every = torch.arange(len(some), device=y.device)
         trace = filter(some, seen, state=state, generator=generator, keep=every, project=False)
         state = trace.state
-        said = filter.forecast(trace.kept, ahead=list(ahead))
+        said = filter.forecast(trace.kept, ahead=ahead)
         means.append(said.mean)
         variances.append(said.variance)
         phases.append(said.phase)

@@ -9,6 +9,9 @@ from typing import Any
 STAGES = ("mean", "nearest", "closed_form", "factor", "start", "gradient", "shrinkage")
 """In the order in which they are reported; the first two are what can be said without a filter."""
 
+CLEAR = 2.5
+"""Standard errors that a gain must have: options were chosen on some of the interactions that it is measured on."""
+
 
 class Report(Mapping[str, Any]):
     """What `learn` says of a model. It is read like a dictionary, printed as a table, and cannot be changed.
@@ -71,25 +74,34 @@ def _shown(key: str) -> bool:
     return key in ("loss", "error", "coverage_95") or key.startswith("mae/")
 
 
-def verdict_of(stages: Mapping[str, Mapping[str, float]], chosen: str, interactions: int, reason: str | None) -> str:
+def verdict_of(
+    stages: Mapping[str, Mapping[str, float]],
+    chosen: str,
+    interactions: int,
+    gain: float | None,
+    reason: str | None,
+) -> str:
     """What the scores of the stages come to.
 
     Args:
         stages: their scores; ``mean`` and ``nearest`` among them.
         chosen: the stage whose filter was kept.
         interactions: how many were left out.
+        gain: standard errors by which the squared error is less than the training mean's; None if nobody looked.
         reason: why there was no gradient, or less of it than was asked for; None if there was.
     """
     last = stages.get("shrinkage", stages[chosen])["error"]
     mean, nearest = stages["mean"]["error"], stages["nearest"]["error"]
-    if last < 0.95 * min(mean, nearest):
+    if gain is None:
+        said = "not compared"
+    elif gain < CLEAR or last >= 0.95 * mean:
+        said = "no better than the training mean, as far as so many tell"
+    elif last < 0.95 * nearest:
         said = "better than both"
-    elif last < 0.95 * mean:
-        said = "better than the training mean, not than the nearest demonstration"
     else:
-        said = "no better than the training mean: these sensors tell too little about the end, or there are too few"
+        said = "better than the training mean, not than the nearest demonstration"
     text = (
         f"{said}: at the end {last:.2f} of the targets' spread off, the training mean {mean:.2f}, the nearest "
-        f"demonstration {nearest:.2f}, on {interactions} interactions left out"
+        f"demonstration {nearest:.2f}, on {interactions} interactions left out of their ensembles"
     )
     return f"{text}; {reason}" if reason else text

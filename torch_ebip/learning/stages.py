@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -68,11 +70,28 @@ def reference_scores(held_out: HeldOut, interactions: Tensor) -> tuple[Scores, S
     return first, second
 
 
+class Drawn(NamedTuple):
+    """What was found of shrinkage.
+
+    Attributes:
+        readout: to be given to the filter.
+        shares: of each target modality, one for each of `LEADS`.
+        error: root mean squared error of the end after it, in units of the targets' spread; each interaction drawn by
+            shares that were learned without its fold.
+        gain: by how many standard errors the squared error is then less than the training mean's, pair by pair.
+        gain_alone: the same of the filter alone.
+    """
+
+    readout: Shrinkage
+    shares: dict[str, list[float]]
+    error: float
+    gain: float
+    gain_alone: float
+
+
 @without_autocast
 @torch.no_grad()
-def learn_shrinkage(
-    held_out: HeldOut, filter: InteractionFilter, interactions: Tensor, scored: Tensor
-) -> tuple[Shrinkage, dict[str, list[float]], float]:
+def learn_shrinkage(held_out: HeldOut, filter: InteractionFilter, interactions: Tensor, scored: Tensor) -> Drawn:
     """How far towards the training mean forecasts are best drawn, by modality and lead: least squares in [0, 1].
 
     With few interactions the shares are pulled towards 1, where the filter speaks alone.
@@ -82,19 +101,16 @@ def learn_shrinkage(
         filter: whose forecasts are drawn; without a read-out.
         interactions: int64 [B], that decide.
         scored: int64 [S], those among them whose error is told.
-
-    Returns:
-        The read-out; the shares by target, one for each of `LEADS`; and the root mean squared error of the end after
-        it, in units of the targets' spread.
     """
     task = held_out.task
     primitive, targets, scale = task.primitive, task.targets, task.objective.scale
     modality = primitive.layout.modality_of_dof.to(targets.device)[targets]
     groups = sorted(set(modality.tolist()))
+    fold_of = held_out.partition.fold_of.to(targets.device)
+    folds, K = held_out.settings.folds, len(LEADS)
     leads = scale.new_tensor(LEADS, dtype=torch.float64)
-    gram = {group: leads.new_zeros(len(LEADS), len(LEADS)) for group in groups}
-    moment = {group: leads.new_zeros(len(LEADS)) for group in groups}
-    kept: list[tuple[Tensor, Tensor, Tensor]] = []
+    gram, moment = leads.new_zeros(len(groups), folds, K, K), leads.new_zeros(len(groups), folds, K)
+    ends: list[tuple[Tensor, ...]] = []
     for subset in task.subsets.values():
         for trial in held_out.trials(filter, interactions, subset):
             shown = trial.shown
@@ -105,28 +121,43 @@ def learn_shrinkage(
             wanted = ((held_out.truth(shown.interactions, phase) - mean) / scale).double()
             now = trial.filter.phase(trial.trace.kept).clamp(0, 1).unsqueeze(-1)
             basis = hats((phase - now).clamp(0, 1).double(), leads)
+            fold = fold_of[shown.interactions]
             told = torch.isin(shown.interactions, scored.to(shown.interactions.device))
-            kept.append((basis[told, :, -1], towards[told, :, -1], wanted[told, :, -1]))
-            for group in groups:
+            ends.append((*(part[told, :, -1] for part in (basis, towards, wanted)), fold[told]))
+            for i, group in enumerate(groups):
                 ours = modality == group
                 square = towards[..., ours].square().sum(-1)
                 product = (towards[..., ours] * wanted[..., ours]).sum(-1)
-                gram[group] += torch.einsum("bkpi,bkp,bkpj->ij", basis, square, basis)
-                moment[group] += torch.einsum("bkpi,bkp->i", basis, product)
-    share = scale.new_ones(primitive.layout.n_dofs, len(LEADS))
-    found: dict[str, list[float]] = {}
-    for group in groups:
-        # Every process saw a part of the interactions.
-        held_out.ranks.add_up([gram[group], moment[group]])
-        best = _within(gram[group], moment[group], 2 / len(interactions))
-        found[primitive.layout.names[group]] = [round(float(value), 4) for value in best]
+                gram[i].index_add_(0, fold, torch.einsum("bkpi,bkp,bkpj->bij", basis, square, basis))
+                moment[i].index_add_(0, fold, torch.einsum("bkpi,bkp->bi", basis, product))
+    held_out.ranks.add_up([gram, moment])  # every process saw a part of the interactions
+    pull = 2 / len(interactions)
+    share = scale.new_ones(primitive.layout.n_dofs, K)
+    without = leads.new_ones(folds, len(modality), K)
+    shares: dict[str, list[float]] = {}
+    for i, group in enumerate(groups):
+        best = _within(gram[i].sum(0), moment[i].sum(0), pull)
+        shares[primitive.layout.names[group]] = [round(float(value), 4) for value in best]
         share[primitive.layout.modality_of_dof.to(share.device) == group] = best.to(share)
-    ours = share[targets].double()
-    basis, towards, wanted = (torch.cat(parts) for parts in zip(*kept, strict=True))
-    squares = (torch.einsum("bki,di->bkd", basis, ours) * towards - wanted).square().flatten()
-    sums = torch.stack([squares.sum(), squares.new_tensor(len(squares))])
+        for left in range(folds):
+            others = gram[i].sum(0) - gram[i, left], moment[i].sum(0) - moment[i, left]
+            without[left, modality == group] = _within(*others, pull)
+    basis, towards, wanted, fold = (torch.cat(parts) for parts in zip(*ends, strict=True))
+    drawn = torch.einsum("bki,bdi->bkd", basis, without[fold]) * towards
+    errors = torch.stack(
+        [(said - wanted).square().mean((1, 2)) for said in (drawn, towards, torch.zeros_like(wanted))]
+    )
+    better = errors[2] - errors[:2]
+    sums = torch.cat(
+        [errors.new_tensor([len(fold)]), errors[0].sum().view(1), better.sum(-1), better.square().sum(-1)]
+    )
     held_out.ranks.add_up([sums])
-    return Shrinkage(share), found, float((sums[0] / sums[1]).sqrt())
+    count, error, differences, squares = float(sums[0]), float(sums[1] / sums[0]), sums[2:4], sums[4:6]
+    spread = (squares / count - (differences / count).square()).clamp(min=0).sqrt()
+    # Interactions are what is independent, not the sets of sensors that each was shown with.
+    root = max(count / len(task.subsets), 1.0) ** 0.5
+    gains = (differences / count * root / spread.clamp(min=1e-12)).tolist()
+    return Drawn(Shrinkage(share), shares, error**0.5, *gains)
 
 
 def _within(gram: Tensor, moment: Tensor, pull: float) -> Tensor:

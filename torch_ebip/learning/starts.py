@@ -5,6 +5,7 @@ Both are searched for on interactions that are left out. One factor is what a sc
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from itertools import product
 from pathlib import Path
@@ -96,7 +97,7 @@ def best_factor(
     if record is not None and record.exists():
         content = read_json(record)
         try:
-            stored = {float(factor): loss for factor, loss in content.items()}
+            stored = {float(factor): _loss(loss) for factor, loss in content.items()}
             return min(stored, key=lambda factor: stored[factor])
         except (AttributeError, TypeError, ValueError) as error:
             raise ValueError(f"{record}: expected a loss for every factor: {error}") from error
@@ -106,7 +107,7 @@ def best_factor(
     def measure(factors: Sequence[float]) -> None:
         for factor in factors:
             if factor not in losses:
-                losses[factor] = held_out.evaluate(build(held_out.task.primitive, factor), order)["loss"]
+                losses[factor] = _loss(held_out.evaluate(build(held_out.task.primitive, factor), order)["loss"])
             tick()
 
     measure(factors)
@@ -153,7 +154,12 @@ def best_start(
     else:
         losses = read_json(record)
     try:
-        best = min(losses, key=lambda entry: entry["loss"])
+        best = min(losses, key=lambda entry: _loss(entry["loss"]))
         return Start(best["factor"], best["sharpness"])
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{record}: expected a list of starts with their losses: {error}") from error
+
+
+def _loss(loss: float | None) -> float:
+    """A loss that can be compared: one that is no number, in a file null, is the worst."""
+    return math.inf if loss is None or math.isnan(loss) else loss

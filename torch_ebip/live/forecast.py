@@ -52,8 +52,9 @@ def sampled(end: float, rate: float) -> list[float]:
         ValueError: a rate that is not positive, or more than `MOST_POINTS`.
     """
     rate = as_number("rate", rate, 0, above=True, of="of points a second")
-    count = math.floor(max(end, 0.0) * rate * (1 + 1e-9))
-    if count > MOST_POINTS:
-        raise ValueError(f"{end:g} s at {rate:g} Hz are {count} points, expected at most {MOST_POINTS}")
+    points_there = max(end, 0.0) * rate * (1 + 1e-9)
+    if not points_there <= MOST_POINTS:
+        raise ValueError(f"{end:g} s at {rate:g} Hz are {points_there:g} points, expected at most {MOST_POINTS}")
+    count = math.floor(points_there)
     points = [i / rate for i in range(1, count + 1)]
     return points if points and end - points[-1] < 1e-6 else [*points, max(end, 0.0)]

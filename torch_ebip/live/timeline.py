@@ -12,7 +12,7 @@ from torch_ebip.interaction.forecast import Forecast
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.live.engine import make_engine
 from torch_ebip.live.intake import Array, Freshness, Intake, SensorReport, as_vector, training_ranges
-from torch_ebip.live.opening import Clock, Opening
+from torch_ebip.live.opening import Clock, Lost, Opening
 from torch_ebip.live.settings import SessionSettings, patience_of
 
 TOLERANCE = 1e-3
@@ -52,7 +52,9 @@ class Timeline:
         self._engine = make_engine(filter, layout.mask(sensors), layout.controlled, self._slots + 1, settings.seed)
         self._engine.save(self._slots)
         self._like = next(filter.parameters())
-        self._clock = Clock(dt, len(sensors))
+        longest = float((1 / primitive.phase_velocity).max())
+        self._clock = Clock(dt, longest, len(sensors))
+        self._lost = Lost(settings.longest_gap) if isinstance(settings.start, str) else None
         self._opening = Opening(settings.window) if isinstance(settings.start, str) else None
         self.ticks = 0
         self._head: int
@@ -83,10 +85,15 @@ class Timeline:
 
     def push(self, number: int, vector: Array | None, moment: float) -> None:
         """Take a sample of a sensor, `plain` numbers, taken at a time in s, NaN if it is none."""
-        self._clock.see(number, moment)
+        if vector is not None:
+            self._clock.see(number, moment)
         opening = self._opening
         if opening is None:
+            usable = self._lost is not None and self._intake.says_something(number, vector, moment)
+            before = self._intake.reports[number].early
             self._take(number, vector, moment)
+            if usable:
+                self._find(number, vector, moment, self._intake.reports[number].early == before)
             return
         usable, waiting = self._intake.says_something(number, vector, moment), self.waiting
         if opening.add(number, vector, moment, usable) and opening.start is not None:
@@ -99,6 +106,18 @@ class Timeline:
             self._take(number, vector, moment)
         if usable and opening.over(moment):
             self._opening = None
+        if usable and not waiting:
+            early = abs(moment - self._start) > self.settings.longest_gap
+            self._find(number, vector, moment, not early)
+
+    def _find(self, number: int, vector: Array | None, moment: float, accepted: bool) -> None:
+        """Begin again where samples agree, if none of them is near the first."""
+        again = None if self._lost is None else self._lost.add(number, vector, moment, accepted)
+        if again is not None:
+            self._opening = Opening(self.settings.window)
+            self._now = self._newest = -math.inf
+            for sample in again:
+                self.push(*sample)
 
     def advance(self, now: float | None) -> None:
         """Filter up to the present, s; default: the newest time of any sample.

@@ -162,15 +162,36 @@ class StackedBasis(nn.Module):
         Returns:
             [..., P, D], squared units of the DoFs.
         """
+        blocks = []
+        for run in self._runs:
+            count = run.dofs.stop - run.dofs.start
+            block = covariance[..., run.weights, run.weights]
+            split = (count, block.shape[-1] // count)
+            block = block.reshape(*block.shape[:-2], *split, *split)
+            blocks.append(block.diagonal(dim1=-4, dim2=-2).movedim(-1, -3))
+        return self.project_variances(phase, blocks)
+
+    def variances(self, weights: Tensor) -> list[Tensor]:
+        """Covariances of the weights of each DoF among themselves, over N sets of weights [N, n_weights].
+
+        Returns:
+            [k, B, B] for each run of k neighbouring DoFs with equal bases, for `project_variances`.
+        """
+        centred = weights - weights.mean(0)
+        blocks = []
+        for run, block in zip(self._runs, self._blocks(centred), strict=True):
+            own = block.reshape(len(weights), run.dofs.stop - run.dofs.start, -1)
+            blocks.append(torch.einsum("nkb,nkc->kbc", own, own) / (len(weights) - 1))
+        return blocks
+
+    @without_autocast
+    def project_variances(self, phase: Tensor, blocks: Sequence[Tensor]) -> Tensor:
+        """Variance of h(phi, w), [..., P, D], squared units, at phases [..., P], of blocks that `variances` gives."""
         features = [basis(phase) for basis in self.families]
         parts = []
-        for run in self._runs:
+        for run, block in zip(self._runs, blocks, strict=True):
             functions = features[run.basis]
-            split = (run.dofs.stop - run.dofs.start, functions.shape[-1])
-            blocks = covariance[..., run.weights, run.weights]
-            blocks = blocks.reshape(*blocks.shape[:-2], *split, *split)
-            own = blocks.diagonal(dim1=-4, dim2=-2).movedim(-1, -3)
-            parts.append(torch.einsum("...pa,...kab,...pb->...pk", functions, own, functions))
+            parts.append(torch.einsum("...pa,...kab,...pb->...pk", functions, block, functions))
         return torch.cat(parts, dim=-1)
 
     def _paths(self, features: Sequence[Tensor], weights: Tensor, dofs: Sequence[int] | None) -> Tensor:
