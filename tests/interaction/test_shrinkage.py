@@ -32,7 +32,9 @@ def test_seconds_ahead_are_each_members_own(options: dict) -> None:
         members = state.members.numpy()
     weights = np.full(len(members), 1 / len(members)) if state.weights is None else state.weights.detach().numpy()
     for i, seconds in enumerate(ahead):
-        phase = np.ones(len(members)) if seconds == math.inf else members[:, 0] + members[:, 1] * seconds
+        phase = (
+            np.ones(len(members)) if seconds == math.inf else members[:, 0] + np.maximum(members[:, 1], 0) * seconds
+        )
         phase = np.minimum(phase, 1.0)
         values = primitive.basis.project(torch.tensor(phase), torch.tensor(members[:, 2:])).numpy()
         mean = weights @ values
@@ -56,6 +58,34 @@ def test_other_filters_forecast_by_seconds_too(make) -> None:
     assert torch.allclose(said.mean[1], end.mean[0])
     assert torch.allclose(said.variance[1], end.variance[0], rtol=1e-5)
     assert 0 < float(said.phase[0]) <= 1
+
+
+def test_members_that_run_backwards_wait() -> None:
+    """However far ahead: they have no end to come to, and nothing runs out of the interaction at its beginning."""
+    filter = ebip(small_primitive(torch.float64))
+    state = filter.initial_state()
+    members = state.deviations.clone()
+    members[:, 1] = -0.7
+    back = state._replace(deviations=members)
+    said = filter.forecast(back, ahead=[0.0, 1.0, 1e6])
+    assert torch.equal(said.phase[0], said.phase[2])
+    assert torch.equal(said.mean[0], said.mean[2])
+
+
+def test_a_live_forecast_does_not_look_at_all_demonstrations_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    filter = ebip(small_primitive(torch.float64))
+    filter.readout = Shrinkage(torch.full((5, 5), 0.5, dtype=torch.float64))
+    state, looked = filter.initial_state(), []
+    basis = filter.basis_projection.basis
+    whole = type(basis).variances
+    monkeypatch.setattr(type(basis), "variances", lambda self, weights: looked.append(1) or whole(self, weights))
+    first = filter.forecast(state, 1.0)
+    filter.forecast(state, 0.5)
+    assert len(looked) == 1
+    with torch.no_grad():
+        filter.prior.states[:, 2:] *= 2.0
+    assert not torch.equal(filter.forecast(state, 1.0).mean, first.mean)
+    assert len(looked) == 2
 
 
 def test_seconds_that_are_none_are_refused() -> None:

@@ -242,6 +242,8 @@ def test_parts_that_do_not_belong_together_are_refused() -> None:
     other = small_primitive(count=10)
     with pytest.raises(ValueError, match="not the demonstrations of this primitive"):
         InteractionModel(ebip(other), primitive)
+    with pytest.raises(ValueError, match="must have one dtype"):
+        InteractionModel(ebip(primitive).double(), primitive)
     with pytest.raises(ValueError, match="2 labels for 24"):
         InteractionModel(ebip(primitive), primitive, labels=("a", "b"))
     with pytest.raises(ValueError, match="no modality 'leg'"):
