@@ -153,7 +153,7 @@ def build_filter(primitive: InteractionPrimitive, description: Description) -> I
 
 
 def tensors_of(filter: nn.Module) -> dict[str, Tensor]:
-    """Parameters and persistent buffers by name."""
+    """Parameters and persistent buffers [...] by name."""
     return {
         name: tensor
         for name, tensor in filter.state_dict().items()
@@ -162,14 +162,14 @@ def tensors_of(filter: nn.Module) -> dict[str, Tensor]:
 
 
 def own_tensors(filter: nn.Module, made: nn.Module) -> dict[str, Tensor]:
-    """What a filter has and one that was just made with the same options has not: its numbers, by name."""
+    """What a filter has and one just ``made`` with the same options has not: its numbers [...], by name."""
     theirs = tensors_of(made)
     return {name: tensor for name, tensor in tensors_of(filter).items() if not torch.equal(tensor, theirs[name])}
 
 
 @torch.no_grad()
 def fill(filter: nn.Module, tensors: Mapping[str, Tensor]) -> None:
-    """Give a filter the tensors by name, all of those that it does not have from its primitive.
+    """Give a filter the tensors [...] by name, all of those that it does not have from its primitive.
 
     Raises:
         ValueError: a tensor that it does not have, or of another shape.

@@ -79,9 +79,7 @@ class InteractionModel:
         if self.filter.dof_names != layout.dofs:
             raise ValueError("the filter has other columns than the primitive, or in another order")
         if abs(self.filter.dt * self.primitive.rate - 1) > 1e-6:
-            raise ValueError(
-                f"the filter takes {1 / self.filter.dt:g} samples a second, the primitive {self.primitive.rate:g}"
-            )
+            raise ValueError(f"the filter takes {1 / self.filter.dt:g} samples a second, the primitive {self.rate:g}")
         dtypes = {tensor.dtype for tensor in (*self.filter.parameters(), self.filter.prior.states)}
         if dtypes != {self.primitive.weights.dtype}:
             raise ValueError(
@@ -293,9 +291,9 @@ def load_model(path: str | os.PathLike[str]) -> InteractionModel:
     """
     place = Path(path)
     if place.is_dir():
-        if not (place / NAME).exists():
-            inside = sorted(part.parent.name for part in place.glob(f"*/{NAME}"))
-            hint = f"; there is one in {', '.join(inside[:10])}" if inside else ""
-            raise FileNotFoundError(f"{place}: no {NAME} in this folder{hint}")
         place = place / NAME
+        if not place.exists():
+            inside = sorted(part.parent.name for part in place.parent.glob(f"*/{NAME}"))
+            hint = f"; there is one in {', '.join(inside[:10])}" if inside else ""
+            raise FileNotFoundError(f"{place.parent}: no {NAME} in this folder{hint}")
     return InteractionModel.load(place)

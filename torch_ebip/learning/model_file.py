@@ -33,7 +33,7 @@ HEADER_LIMIT = 1 << 24
 def write_model_file(
     path: str | os.PathLike[str], description: Mapping[str, Any], tensors: Mapping[str, Tensor]
 ) -> None:
-    """Write a model's description, JSON, and its tensors by name to a path, atomically.
+    """Write a model's description, JSON, and its tensors [...] by name to a path, atomically.
 
     Raises:
         ImportError: safetensors is not installed.
@@ -47,7 +47,7 @@ def write_model_file(
 
 
 def read_model_file(path: str | os.PathLike[str], limit: int = LIMIT) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """The description and the tensors of a model; executes nothing of it.
+    """The description and the tensors [...] of a model; executes nothing of it.
 
     Args:
         path: of the file.

@@ -15,7 +15,7 @@ def example() -> Demonstrations:
     Example:
         >>> from torch_ebip.recordings import example
         >>> example()
-        Demonstrations(30 of 45 to 75 samples at 30 Hz, 11 DoFs: hand, gaze, robot)
+        Demonstrations(30 of 47 to 75 samples at 30 Hz, 11 DoFs: hand, gaze, robot)
     """
     with resources.as_file(resources.files("torch_ebip.recordings").joinpath("example.npz")) as path:
         return Demonstrations.load(path)

@@ -186,7 +186,12 @@ class StackedBasis(nn.Module):
 
     @without_autocast
     def project_variances(self, phase: Tensor, blocks: Sequence[Tensor]) -> Tensor:
-        """Variance of h(phi, w), [..., P, D], squared units, at phases [..., P], of blocks that `variances` gives."""
+        """Variance of h(phi, w), [..., P, D], squared units of the DoFs.
+
+        Args:
+            phase: [..., P].
+            blocks: as `variances` gives them.
+        """
         features = [basis(phase) for basis in self.families]
         parts = []
         for run, block in zip(self._runs, blocks, strict=True):
