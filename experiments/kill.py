@@ -31,6 +31,8 @@ from experiments.rerun import compare
 from experiments.run_folder import RunFolder
 from torch_ebip import Demonstrations, Layout, Modality
 from torch_ebip.common.files import read_json
+from torch_ebip.learning.interaction_model import NAME
+from torch_ebip.learning.model_file import read_model_file
 
 LAYOUT = Layout(
     [
@@ -39,7 +41,7 @@ LAYOUT = Layout(
         Modality("arm", ["joint_1", "joint_2"], "rad", controlled=True),
     ]
 )
-STAGES = {"results.json": "finished", "filter.pt": "evaluated", "checkpoint.pt": "tuning", "config.json": "started"}
+STAGES = {"results.json": "finished", NAME: "learned", "checkpoint.pt": "tuning", "config.json": "started"}
 """What stands in a run's folder at each stage, the latest first."""
 
 
@@ -64,6 +66,8 @@ def damage(folder: Path) -> list[str]:
                 read_json(file)
             elif file.suffix == ".pt":
                 torch.load(file, weights_only=True)
+            elif file.suffix == ".safetensors":
+                read_model_file(file)
             elif file.suffix == ".png" and not file.read_bytes().endswith(b"IEND\xaeB`\x82"):
                 raise ValueError("cut off")
         except Exception as error:  # whatever it is, the file is damaged
@@ -75,10 +79,10 @@ def strangers(folder: Path, reference: Path) -> list[str]:
     """What differs from the undisturbed run: numbers, parameters, and files that it does not have."""
     comparison = compare(read_json(reference / "results.json"), read_json(folder / "results.json"))
     found = [f"{d.place}: {d.before} there, {d.after} here" for d in comparison.differing]
-    mine, theirs = (torch.load(path / "filter.pt", weights_only=True)["content"] for path in (folder, reference))
-    for name, parameter in theirs["parameters"].items():
-        if not torch.equal(parameter, mine["parameters"][name]):
-            found.append(f"filter.pt: {name} differs")
+    mine, theirs = (read_model_file(path / NAME)[1] for path in (folder, reference))
+    for name, tensor in theirs.items():
+        if name not in mine or not torch.equal(tensor, mine[name]):
+            found.append(f"{NAME}: {name} differs")
     names = [{p.name for p in path.rglob("*") if "tfevents" not in p.name} for path in (folder, reference)]
     return found + [f"{name}: only in one of them" for name in sorted(names[0] ^ names[1])]
 

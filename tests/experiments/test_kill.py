@@ -14,7 +14,7 @@ import torch
 from experiments.kill import damage, main, stage, strangers
 from experiments.run_folder import RunFolder
 from torch_ebip.common.files import write_json
-from torch_ebip.learning.checkpoint import save_checkpoint
+from torch_ebip.learning.model_file import write_model_file
 
 
 def test_a_killed_run_ends_in_the_same_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -31,27 +31,32 @@ def finished(tmp_path: Path) -> Path:
     """Two folders of the same run: this one and ``reference`` beside it."""
     for folder in (tmp_path / "mine", tmp_path / "reference"):
         write_json(folder / "results.json", {"rows": [{"mean": 0.5}]})
-        save_checkpoint(folder / "filter.pt", {}, {"parameters": {"a": torch.ones(3)}})
+        write_model_file(folder / "model.safetensors", {}, {"a": torch.ones(3)})
     return tmp_path / "mine"
 
 
 def test_the_campaign_sees_damage(finished: Path) -> None:
     assert damage(finished) == []
-    (finished / "filter.pt").write_bytes((finished / "filter.pt").read_bytes()[:-40])
+    path = finished / "model.safetensors"
+    path.write_bytes(path.read_bytes()[:-4])
     (finished / "results.json").write_text('{"rows": [')
     (finished / "noise.png").write_bytes(b"\x89PNG")
-    (finished / ".filter.pt.1234.part").write_bytes(b"")
-    assert [line.split(":")[0] for line in damage(finished)] == ["filter.pt", "noise.png", "results.json"]
+    (finished / ".model.safetensors.1234.part").write_bytes(b"")
+    assert [line.split(":")[0] for line in damage(finished)] == ["model.safetensors", "noise.png", "results.json"]
 
 
 def test_the_campaign_sees_other_numbers(finished: Path) -> None:
     reference = finished.parent / "reference"
     assert strangers(finished, reference) == []
     write_json(finished / "results.json", {"rows": [{"mean": 0.6}]})
-    save_checkpoint(finished / "filter.pt", {}, {"parameters": {"a": torch.tensor([1.0, 1.0, 1.0 + 1e-6])}})
+    write_model_file(finished / "model.safetensors", {}, {"a": torch.tensor([1.0, 1.0, 1.0 + 1e-6])})
     (finished / ".left.part").write_bytes(b"")
     found = strangers(finished, reference)
-    assert found == ["rows/0/mean: 0.5 there, 0.6 here", "filter.pt: a differs", ".left.part: only in one of them"]
+    assert found == [
+        "rows/0/mean: 0.5 there, 0.6 here",
+        "model.safetensors: a differs",
+        ".left.part: only in one of them",
+    ]
     assert stage(finished) == "finished"
 
 
@@ -86,7 +91,8 @@ if __name__ == "__main__":
 def test_workers_end_with_the_run_that_started_them(tmp_path: Path) -> None:
     program, note = tmp_path / "program.py", tmp_path / "worker"
     program.write_text(WORKER)
-    parent = subprocess.Popen([sys.executable, str(program), str(note)])
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    parent = subprocess.Popen([sys.executable, str(program), str(note)], env=environment)
     try:
         assert _within(60, lambda: note.exists() and note.read_text() != "")
         worker = int(note.read_text())

@@ -43,7 +43,7 @@ def model():
 
 
 def test_it_is_the_recipe_step_by_step() -> None:
-    """What `experiments/methods.py` did, written out again with the parts that it was made of."""
+    """Written out again with the parts that it is made of."""
     known = interactions(20)
     model = learn(known, shrink=False, **QUICK)
     primitive = InteractionPrimitive.fit(known, select_basis(known))

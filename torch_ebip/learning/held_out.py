@@ -76,7 +76,7 @@ class Trial(NamedTuple):
         return brief(self)
 
     def terms(self, objective: ForecastObjective) -> dict[str, Tensor]:
-        """The weighted terms of an objective, [] each, by name."""
+        """The weighted terms [] of an objective by name: see `ForecastObjective.forward` [...]."""
         shown = self.shown
         terms: dict[str, Tensor] = objective(
             self.filter, self.trace, shown.observed, shown.truth, shown.now, shown.targets

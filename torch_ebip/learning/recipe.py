@@ -65,7 +65,8 @@ def learn(
         members: E, of ensembles while tuning and of the model's filter; default: all demonstrations.
         arm: whose tool's distance (m) is a term of what is minimised; default: none. A loss says how much
             the rotation counts, otherwise 0.1.
-        joints: name of the target that holds the arm's joints (rad, or m where one slides); default: the one whose DoFs have their names, or are as many.
+        joints: name of the target that holds the arm's joints (rad, or m where one slides); default: the one whose
+            DoFs have their names, or are as many.
         basis: default: `select_basis`.
         shrink: whether forecasts are drawn towards the training mean, see `Shrinkage`.
         scan: how many interactions decide where the gradient starts.

@@ -190,7 +190,7 @@ class StackedBasis(nn.Module):
 
         Args:
             phase: [..., P].
-            blocks: as `variances` gives them.
+            blocks: [k, B, B] for each run, as `variances` gives them.
         """
         features = [basis(phase) for basis in self.families]
         parts = []
