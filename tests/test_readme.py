@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import os
 import re
 import subprocess
 import sys
@@ -31,14 +30,11 @@ def test_every_kind_of_block_is_checked() -> None:
     assert {language for language, _ in BLOCKS} == {"bash", "python", "bibtex"}
 
 
-def test_the_python_runs(tmp_path: Path) -> None:
-    """In a folder of its own: it leaves a model there. From an installed wheel: `test_wheel`."""
+def test_the_python_is_twelve_lines() -> None:
+    """`test_wheel` runs them, from an installed wheel."""
     (block,) = _blocks("python")
     lines = [line for line in block.splitlines() if line]
     assert len(lines) <= 12 + 1  # the report is printed beside the twelve
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    subprocess.run([sys.executable, "-c", block], check=True, cwd=tmp_path, env=environment)
-    assert [path.name for path in tmp_path.iterdir()] == ["handover.safetensors"]
 
 
 @pytest.mark.parametrize("page", sorted(path.name for path in (ROOT / "docs").glob("*.md")))
