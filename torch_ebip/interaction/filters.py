@@ -172,7 +172,8 @@ class InteractionFilter(Filter):
             weights = states[:, self.phase_model.moving :]
             self._spread = states, version, weights.mean(0), basis.variances(weights)
         _, _, mean, blocks = self._spread
-        return basis.project_paths(phase, mean), basis.project_variances(phase, blocks).clamp(min=0)
+        path, variance = basis.project_moments(phase, mean, blocks)
+        return path, variance.clamp(min=0)
 
     def attribution(self, state: State) -> Tensor:
         """Which demonstrations speak: the mean forecast is this affine combination of their trajectories.

@@ -58,8 +58,12 @@ class Shrinkage(nn.Module):
 
     def at(self, lead: Tensor) -> Tensor:
         """s [..., D] at leads [...] in phase."""
-        lead = lead.clamp(float(self.leads[0]), float(self.leads[-1]))
-        return torch.einsum("...k,dk->...d", hats(lead, self.leads), self.share)
+        leads, share = self.leads, self.share.T
+        right = torch.searchsorted(leads, lead.contiguous(), right=True).clamp(1, len(leads) - 1)
+        left = right - 1
+        start = leads[left]
+        part = ((lead - start) / (leads[right] - start)).clamp(0, 1).unsqueeze(-1)
+        return torch.lerp(share[left], share[right], part)
 
     def forward(self, forecast: Forecast, lead: Tensor, mean: Tensor, variance: Tensor) -> Forecast:
         """Draw a forecast towards the demonstrations.

@@ -185,6 +185,18 @@ class StackedBasis(nn.Module):
         return blocks
 
     @without_autocast
+    def project_moments(self, phase: Tensor, mean: Tensor, blocks: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+        """Mean and variance of h(phi, w), [..., P, D] each, units of the DoFs and squared.
+
+        Args:
+            phase: [..., P].
+            mean: of the weights, [n_weights].
+            blocks: [k, B, B] for each run, as `variances` gives them.
+        """
+        features = [basis(phase) for basis in self.families]
+        return self._paths(features, mean, None), self._variances(features, blocks)
+
+    @without_autocast
     def project_variances(self, phase: Tensor, blocks: Sequence[Tensor]) -> Tensor:
         """Variance of h(phi, w), [..., P, D], squared units of the DoFs.
 
@@ -192,12 +204,14 @@ class StackedBasis(nn.Module):
             phase: [..., P].
             blocks: [k, B, B] for each run, as `variances` gives them.
         """
-        features = [basis(phase) for basis in self.families]
+        return self._variances([basis(phase) for basis in self.families], blocks)
+
+    def _variances(self, features: Sequence[Tensor], blocks: Sequence[Tensor]) -> Tensor:
         parts = []
         for run, block in zip(self._runs, blocks, strict=True):
             functions = features[run.basis]
             parts.append(torch.einsum("...pa,...kab,...pb->...pk", functions, block, functions))
-        return torch.cat(parts, dim=-1)
+        return torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0]
 
     def _paths(self, features: Sequence[Tensor], weights: Tensor, dofs: Sequence[int] | None) -> Tensor:
         parts = []
