@@ -105,6 +105,7 @@ def best_factor(
     order = scanned(held_out, interactions)
 
     def measure(factors: Sequence[float]) -> None:
+        """Losses of those that are not known yet."""
         for factor in factors:
             if factor not in losses:
                 losses[factor] = _loss(held_out.evaluate(build(held_out.task.primitive, factor), order)["loss"])
