@@ -17,11 +17,12 @@ from pathlib import Path
 
 import torch
 
+from experiments import moveint
 from experiments.command_line import add_data_options, add_run_options, command, experiment_parser
 from experiments.data import choose_subsets, load, thinning
 from experiments.entries import METHODS, Fold
 from experiments.evaluate import evaluate
-from experiments.figures import results_figure
+from experiments.figures import horizons_figure, results_figure
 from experiments.folds import LOST, mean_of_cells, read_values, run_folds, share_cores, split, write_values
 from experiments.paper_table import paper_rows
 from experiments.results import Values, markdown, print_tables, summarise
@@ -82,6 +83,9 @@ def run_fold(job: Job) -> Values:
 def main(arguments: list[str] | None = None) -> None:
     """Run the experiment from the command line."""
     options = _parser().parse_args(arguments)
+    if options.protocol == "moveint":
+        moveint.run(options, arguments)
+        return
     began = time.monotonic()
     ranks = Ranks.start()
     tuning = TuningSettings(seed=options.seed, steps=options.steps)
@@ -166,6 +170,7 @@ def main(arguments: list[str] | None = None) -> None:
     with atomic_write(run.path / "results.md") as file:
         file.write(markdown(results).encode())
     save_figure(results_figure(results, panels), run.path / "results.png")
+    save_figure(horizons_figure(results, panels), run.path / "horizons.png")
     run.finish(results)
     print_tables(results, only=panels)
     print(f"all tables: {run.path / 'results.md'}")
@@ -185,9 +190,13 @@ def _parser() -> argparse.ArgumentParser:
         help="sensors shown together, modality names joined by +, or `all` "
         "(default: those of the paper; with --data each modality alone, and all)",
     )  # fmt: skip
+    parser.add_argument(
+        "--protocol", choices=("folds", "moveint"), default="folds",
+        help="how: cross-validation, or the protocol of MoVEInt, see experiments/moveint.py (default: folds)",
+    )  # fmt: skip
     parser.add_argument("--members", type=int, metavar="E", help="of ensembles (default: N of the training part)")
     parser.add_argument(
-        "--steps", type=int, default=40, help="gradient steps of a tuned filter at most (default: 40)"
+        "--steps", type=int, default=100, help="gradient steps of a tuned filter at most (default: 100)"
     )
     add_run_options(parser, "compare", "data, splits and draws", "a small run of a few minutes", workers=True)
     return parser

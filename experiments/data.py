@@ -14,6 +14,9 @@ from torch_ebip.learning.settings import settings_for
 FRACTIONS = (0.43, 0.82)
 """Shares of an interaction that the paper shows: before the ball is thrown, and on its way."""
 
+AHEAD = (0.1, 0.25, 0.5, 1.0)
+"""Seconds after the last sample that is shown: what a partner needs is what comes next."""
+
 
 @dataclass(frozen=True)
 class Roles:
@@ -58,13 +61,13 @@ def load(data: str | None, count: int, seed: int, roles: Roles | None = None) ->
                 arm = made, joints_of(made, layout, targets)[0]
         except (ValueError, OSError) as error:
             raise SystemExit(str(error)) from error
-        return demonstrations, Task({"all": sensors}, FRACTIONS, [], targets, {}, arm)
+        return demonstrations, Task({"all": sensors}, FRACTIONS, [], targets, {}, arm, AHEAD)
     if roles != Roles():
         raise SystemExit("--sensors, --targets, --arm and --tip go with --data")
     from experiments.ball_catching import SUBSETS, load_or_generate, teacher
 
     task = Task(
-        SUBSETS, FRACTIONS, [("ball", FRACTIONS[0])], ["robot", "ball"], {"robot": 3}, (teacher.arm(), "robot")
+        SUBSETS, FRACTIONS, [("ball", FRACTIONS[0])], ["robot", "ball"], {"robot": 3}, (teacher.arm(), "robot"), AHEAD
     )
     return load_or_generate(count, seed), task
 

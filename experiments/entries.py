@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, fields
@@ -20,9 +21,9 @@ from experiments.evaluate import FilterMethod, MeanMethod, Method, NearestMethod
 from torch_ebip import (
     BSplineBasis,
     Demonstrations,
-    Filter,
     ForecastObjective,
     ForwardKinematicsLoss,
+    InteractionFilter,
     InteractionModel,
     InteractionPrimitive,
     ParticleFilter,
@@ -38,6 +39,7 @@ from torch_ebip import (
 from torch_ebip.learning import Weights
 from torch_ebip.learning.configuration import Task as Tuned
 from torch_ebip.learning.held_out import HeldOut
+from torch_ebip.learning.horizons import AHEAD, reached
 from torch_ebip.learning.ranks import Ranks
 from torch_ebip.learning.starts import FACTORS, best_factor, scaled
 
@@ -87,18 +89,25 @@ class Fold:
         """E."""
         return len(self.primitive) if self.members is None else self.members
 
+    @property
+    def ahead(self) -> tuple[float, ...]:
+        """What is asked for: seconds, and the end."""
+        return (*self.task.ahead, math.inf)
+
     def tuned(self) -> Tuned:
         """What a filter is tuned for that `learn` does not make: as `learn` has it."""
         layout, device = self.primitive.layout, self.primitive.weights.device
         targets = layout.mask(self.task.targets).to(device)
         subsets = {subset: layout.mask(names).to(device) for subset, names in self.task.subsets.items()}
+        ahead = reached(self.primitive, AHEAD)
         if self.task.arm is None:
-            return Tuned(self.primitive, ForecastObjective(self.primitive, targets), targets, subsets)
+            return Tuned(self.primitive, ForecastObjective(self.primitive, targets, ahead=ahead), targets, subsets)
         arm, joints = self.task.arm
         loss = ForwardKinematicsLoss(arm, rotation_weight=0.1)
         objective = ForecastObjective(
-            self.primitive, targets, weights=Weights(tool=1.0), arm=loss, arm_dofs=layout.mask([joints]).to(device)
-        )
+            self.primitive, targets, weights=Weights(tool=1.0), arm=loss, arm_dofs=layout.mask([joints]).to(device),
+            ahead=ahead,
+        )  # fmt: skip
         return Tuned(self.primitive, objective, targets, subsets)
 
     def held_out(self) -> HeldOut:
@@ -106,10 +115,8 @@ class Fold:
         return HeldOut(self.known, self.tuned(), self.tuning)
 
     def factor(self) -> float:
-        """The best one on R; found once, also for what is tuned."""
-        return best_factor(
-            self.held_out(), scaled, self.scan, FACTORS, self.folder / "ebip_tuned" / "scan_scaled.json"
-        )
+        """The best one on R."""
+        return best_factor(self.held_out(), scaled, self.scan, FACTORS, self.folder / "scan_scaled.json")
 
     def model(self) -> InteractionModel:
         """What `learn` makes of it."""
@@ -140,18 +147,18 @@ def _shown(task: Task) -> set[str]:
     return {name for names in task.subsets.values() for name in names}
 
 
-def _filter(build: Callable[[Fold], Filter]) -> Callable[[Fold], Method | None]:
+def _filter(build: Callable[[Fold], InteractionFilter]) -> Callable[[Fold], Method | None]:
     return lambda fold: FilterMethod(build(fold), fold.seed)
 
 
-def _ebip_minus(fold: Fold) -> Filter:
+def _ebip_minus(fold: Fold) -> InteractionFilter:
     with warnings.catch_warnings():
         # That no mixture fits is a finding of the paper, and says so once a fold.
         warnings.filterwarnings("ignore", message="no mixture of up to")
         return ebip_minus(fold.primitive, fold.n_members, seed=fold.seed)
 
 
-def _ebip_scaled(fold: Fold) -> Filter:
+def _ebip_scaled(fold: Fold) -> InteractionFilter:
     return scaled(fold.primitive, fold.factor(), fold.members)
 
 
@@ -167,7 +174,7 @@ def particle_tunable(primitive: InteractionPrimitive, factor: float, members: in
     )
 
 
-def _particle_filter_tuned(fold: Fold) -> Filter:
+def _particle_filter_tuned(fold: Fold) -> InteractionFilter:
     record = fold.folder / "scan_particle.json"
     start = best_factor(fold.held_out(), particle_tunable, fold.scan, FACTORS, record)
     filter = particle_tunable(fold.primitive, start, fold.members)
@@ -186,15 +193,17 @@ def _ballistic(fold: Fold) -> Method | None:
 def _gru(fold: Fold) -> Method:
     tuned, settings = fold.tuned(), RecurrentSettings(seed=fold.seed)
     targets, subsets = tuned.targets.cpu(), {name: mask.cpu() for name, mask in tuned.subsets.items()}
-    return RecurrentMethod(fold.known, targets, subsets, settings)
+    return RecurrentMethod(fold.known, targets, subsets, settings, fold.ahead)
 
 
 METHODS: dict[str, Callable[[Fold], Method | None]] = {
     "mean": lambda fold: MeanMethod(fold.primitive),
     "nearest": lambda fold: NearestMethod(fold.primitive),
     "ballistic": _ballistic,
-    "ridge": lambda fold: RidgeMethod(fold.known, fold.tuned().targets.cpu(), fold.task.fractions),
-    "trees": lambda fold: TreesMethod(fold.known, fold.tuned().targets.cpu(), fold.task.fractions, seed=fold.seed),
+    "ridge": lambda fold: RidgeMethod(fold.known, fold.tuned().targets.cpu(), fold.task.fractions, fold.ahead),
+    "trees": lambda fold: TreesMethod(
+        fold.known, fold.tuned().targets.cpu(), fold.task.fractions, fold.ahead, seed=fold.seed
+    ),
     "gru": _gru,
     "bip": _filter(lambda fold: bip(fold.primitive)),
     "particle_filter": _filter(lambda fold: particle_filter(fold.primitive, fold.members)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, Protocol
 
@@ -11,10 +12,18 @@ import torch
 from torch import Tensor
 
 from experiments.results import Cell, Values
-from torch_ebip import Demonstrations, Filter, Forecast, InteractionPrimitive, RobotArm
+from torch_ebip import (
+    Demonstrations,
+    DemonstrationTable,
+    Forecast,
+    InteractionFilter,
+    InteractionPrimitive,
+    Layout,
+    RobotArm,
+)
 from torch_ebip.common.draws import seeded
 from torch_ebip.learning import metrics as measure
-from torch_ebip.learning.references import ends, nearest
+from torch_ebip.learning.references import ends, last_measured, nearest, recorded
 
 
 class Task(NamedTuple):
@@ -27,6 +36,7 @@ class Task(NamedTuple):
         targets: modalities to forecast, reported one by one.
         leading: how many of a target's first DoFs count for its squared error; default: all.
         arm: for the tool error, with the modality that holds its joints.
+        ahead: seconds after the last sample that is shown, to forecast beside the end.
     """
 
     subsets: Mapping[str, Sequence[str]]
@@ -35,13 +45,18 @@ class Task(NamedTuple):
     targets: Sequence[str]
     leading: Mapping[str, int]
     arm: tuple[RobotArm, str] | None
+    ahead: tuple[float, ...] = ()
+
+
+END = (math.inf,)
+"""What is asked if nothing else is: the end."""
 
 
 class Answer(NamedTuple):
-    """What a method says of the end of B interactions at K fractions.
+    """What a method says of B interactions at K fractions, for A horizons.
 
     Attributes:
-        forecast: of phase 1, mean and variance [B, K, D]; NaN where the method has no opinion or no variance.
+        forecast: mean and variance [B, K, A, D]; NaN where the method has no opinion or no variance.
         phase: [B, K], where it believes the interaction is; NaN if it has no opinion.
     """
 
@@ -52,8 +67,10 @@ class Answer(NamedTuple):
 class Method(Protocol):
     """Anything that answers."""
 
-    def __call__(self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor) -> Answer:
-        """Look at y [B, T, D] where observed, up to samples keep [B, K]; forecast the DoFs bool [D]."""
+    def __call__(
+        self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor, ahead: Sequence[float] = END
+    ) -> Answer:
+        """Look at y [B, T, D] where observed, up to samples keep [B, K]; forecast the DoFs bool [D], ahead [A] s."""
 
 
 class FilterMethod:
@@ -72,7 +89,7 @@ class FilterMethod:
 
     def __init__(
         self,
-        filter: Filter,
+        filter: InteractionFilter,
         seed: int,
         numbers: Sequence[int] | None = None,
         dtype: torch.dtype = torch.float64,
@@ -83,7 +100,9 @@ class FilterMethod:
         self._filter = copy.deepcopy(filter).to(dtype)
 
     @torch.no_grad()
-    def __call__(self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor) -> Answer:
+    def __call__(
+        self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor, ahead: Sequence[float] = END
+    ) -> Answer:
         """See `Method`. DoFs that are neither shown nor asked for are left out of the filter."""
         used = observed.any(0).any(0) | dofs
         part = self._filter.restrict(used, self.thinning)
@@ -93,21 +112,28 @@ class FilterMethod:
         seen = (y[..., used].to(device, self.dtype), observed[..., used].to(device))
         trace = part(*seen, generator=draws, keep=keep.to(device), project=False)
         assert trace.kept is not None
-        forecast = part.forecast(trace.kept, y.new_ones(1)).select(dofs[used].to(device)).at(0)
+        forecast = part.forecast(trace.kept, ahead=list(ahead)).select(dofs[used].to(device))
         tensors = (value.to(y) if isinstance(value, Tensor) else value for value in forecast)
         return Answer(Forecast(*tensors), part.phase(trace.kept).to(y))
 
 
 class MeanMethod:
-    """The mean of the training set, whatever is seen."""
+    """The mean of the training set, whatever is seen: at the time that will have passed since the beginning."""
 
     def __init__(self, primitive: InteractionPrimitive) -> None:
-        self.ends = ends(copy.deepcopy(primitive).cpu())
+        self.primitive = copy.deepcopy(primitive).cpu()
+        self.table, self.ends = DemonstrationTable.of(self.primitive), ends(self.primitive)
 
-    def __call__(self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor) -> Answer:
+    def __call__(
+        self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor, ahead: Sequence[float] = END
+    ) -> Answer:
         """See `Method`."""
-        members = self.ends[:, dofs].expand(*keep.shape, -1, -1)
-        forecast = Forecast(members.mean(-2), members.var(-2), y.new_ones(keep.shape), members)
+        time = keep.unsqueeze(-1) / self.primitive.rate + y.new_tensor(ahead).to(self.ends)  # [B, K, A]
+        every = torch.arange(len(self.ends)).expand(*time.shape, -1)
+        phase = (time.unsqueeze(-1) * self.primitive.phase_velocity).clamp(max=1)
+        members = self.table.at(every, phase.unsqueeze(-1), dofs.nonzero().squeeze(-1)).squeeze(-2)
+        members = torch.where(time.isinf()[..., None, None], self.ends[:, dofs], members).to(y)
+        forecast = Forecast(members.mean(-2), members.var(-2), y.new_ones(time.shape), members)
         return Answer(forecast, y.new_full(keep.shape, torch.nan))
 
 
@@ -119,15 +145,20 @@ class NearestMethod:
 
     def __init__(self, primitive: InteractionPrimitive) -> None:
         self.primitive = copy.deepcopy(primitive).cpu()
-        self.ends = ends(self.primitive)
 
-    def __call__(self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor) -> Answer:
+    def __call__(
+        self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor, ahead: Sequence[float] = END
+    ) -> Answer:
         """See `Method`."""
         primitive = self.primitive
         chosen = nearest(primitive, y, observed, keep, 1 / primitive.rate)
-        mean = self.ends[:, dofs][chosen]
-        at = (keep / primitive.rate * primitive.phase_velocity[chosen]).to(y)
-        return Answer(Forecast(mean, torch.full_like(mean, torch.nan), y.new_ones(keep.shape)), at)
+        velocity = primitive.phase_velocity[chosen]
+        at = keep / primitive.rate * velocity
+        phase = (at.unsqueeze(-1) + y.new_tensor(ahead).to(velocity) * velocity.unsqueeze(-1)).clamp(max=1)
+        used = primitive.basis.dof_of_weight()
+        weights = primitive.weights[:, dofs[used]]
+        mean = primitive.basis.select(dofs).project(phase, weights[chosen].unsqueeze(-2)).to(y)
+        return Answer(Forecast(mean, torch.full_like(mean, torch.nan), phase.to(y)), at.to(y))
 
 
 def evaluate(
@@ -145,34 +176,43 @@ def evaluate(
     lengths = tests.lengths
     layout = tests.layout
     targets = layout.mask(task.targets)
-    truth = torch.stack([last_measured(trajectory) for trajectory in tests])
+    ahead = (*task.ahead, math.inf)
+    ending = torch.stack([last_measured(trajectory) for trajectory in tests])
     steps = torch.stack([(lengths * fraction).round().long() - 1 for fraction in task.fractions], -1).clamp(min=0)
     length = int(steps.max()) + 1
     within = torch.arange(length).view(1, -1, 1) <= steps.amax(-1).view(-1, 1, 1)
     true_phase = steps / (lengths - 1).unsqueeze(-1)
+    happened = recorded(tests.pad()[0], lengths, ending, steps, ending.new_tensor(ahead), tests.rate)
     values: Values = {}
     for subset, names in task.subsets.items():
         observed = measured[:, :length] & layout.mask(names) & within
         for name, method in methods.items():
-            answer = method(y[:, :length], observed, steps, targets)
+            answer = method(y[:, :length], observed, steps, targets, ahead)
             for k, fraction in enumerate(task.fractions):
-                if (subset, fraction) not in task.skipped:
-                    for cell, array in _metrics(task, tests, subset, fraction, answer, k, truth, true_phase[:, k]):
+                if (subset, fraction) in task.skipped:
+                    continue
+                for a, seconds in enumerate(ahead):
+                    truth, forecast = happened[:, k, a], answer.forecast.at(a).at(k)
+                    # Where all of them end sooner there is nothing but NaN, of which a table makes no row.
+                    asked = None if math.isinf(seconds) else seconds
+                    for cell, array in _metrics(task, layout, subset, fraction, asked, forecast, truth):
                         values.setdefault(cell, {})[name] = array.numpy().astype(np.float64)
+                if not answer.phase.isnan().any():
+                    wrong = measure.phase_error(answer.phase[:, k], true_phase[:, k])
+                    cell = Cell(subset, fraction, "phase_error", None, "1")
+                    values.setdefault(cell, {})[name] = wrong.numpy().astype(np.float64)
     return values
 
 
 def _metrics(
     task: Task,
-    tests: Demonstrations,
+    layout: Layout,
     subset: str,
     fraction: float,
-    answer: Answer,
-    k: int,
+    ahead: float | None,
+    said: Forecast,
     truth: Tensor,
-    phase: Tensor,
 ) -> list[tuple[Cell, Tensor]]:
-    layout = tests.layout
     targets = layout.mask(task.targets)
     order = targets.nonzero().squeeze(-1).tolist()
     found: list[tuple[Cell, Tensor]] = []
@@ -180,16 +220,16 @@ def _metrics(
         part = layout.slice(modality)
         columns = [order.index(dof) for dof in range(part.start, part.stop)]
         target = truth[:, part]
-        forecast = answer.forecast.at(k).select(torch.tensor(columns))
+        forecast = said.select(torch.tensor(columns))
         unit = layout[modality].unit
         lead = torch.arange(task.leading.get(modality, len(columns)))
         squares = measure.mse(forecast.select(lead), target[:, lead])
-        found.append((Cell(subset, fraction, "mse", modality, f"{unit}^2"), squares))
-        found.append((Cell(subset, fraction, "mae", modality, unit), measure.mae(forecast, target)))
+        found.append((Cell(subset, fraction, "mse", modality, f"{unit}^2", ahead), squares))
+        found.append((Cell(subset, fraction, "mae", modality, unit, ahead), measure.mae(forecast, target)))
         if not forecast.variance.isnan().all():
             inside = measure.coverage_95(forecast, target)
-            found.append((Cell(subset, fraction, "coverage_95", modality, "1"), inside))
-            found.append((Cell(subset, fraction, "crps", modality, unit), measure.crps(forecast, target)))
+            found.append((Cell(subset, fraction, "coverage_95", modality, "1", ahead), inside))
+            found.append((Cell(subset, fraction, "crps", modality, unit, ahead), measure.crps(forecast, target)))
     if task.arm is not None:
         arm, modality = task.arm
         names = layout[modality].dofs
@@ -197,18 +237,6 @@ def _metrics(
         joints = arm.joint_names if set(arm.joint_names) <= set(names) else names
         places = [layout.dofs.index(name) for name in joints]
         columns = [order.index(dof) for dof in places]
-        distance = measure.tool_error(arm, answer.forecast.at(k).mean[..., columns], truth[:, places])
-        found.append((Cell(subset, fraction, "tool_error", None, "m"), distance))
-    if not answer.phase.isnan().any():
-        found.append(
-            (Cell(subset, fraction, "phase_error", None, "1"), measure.phase_error(answer.phase[:, k], phase))
-        )
+        distance = measure.tool_error(arm, said.mean[..., columns], truth[:, order][:, columns])
+        found.append((Cell(subset, fraction, "tool_error", None, "m", ahead), distance))
     return found
-
-
-def last_measured(trajectory: Tensor) -> Tensor:
-    """[D]: the last measured value of each DoF, NaN for one that was not measured in the last twentieth."""
-    recent = trajectory[-max(1, len(trajectory) // 20) :]
-    steps = torch.arange(len(recent)).unsqueeze(-1)
-    last = torch.where(recent.isnan(), -1, steps).amax(0)
-    return torch.where(last >= 0, recent.gather(0, last.clamp(min=0).unsqueeze(0))[0], torch.nan)

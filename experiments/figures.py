@@ -13,6 +13,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from experiments.results import horizon_grids
 from torch_ebip import Demonstrations, Filter, Layout, MeasurementNoise
 from torch_ebip.learning.metrics import Z95
 
@@ -50,6 +51,7 @@ def results_figure(results: Mapping[str, Any], panels: Sequence[tuple[str, str |
     step, handles = min(0.14, 0.8 / len(methods)), {}
     for axis, (metric, modality) in zip(axes[:, 0], panels, strict=True):
         rows = [row for row in results["rows"] if (row["metric"], row["modality"]) == (metric, modality)]
+        rows = [row for row in rows if "ahead" not in row]
         if not rows:
             axis.set_axis_off()
             continue
@@ -78,6 +80,31 @@ def results_figure(results: Mapping[str, Any], panels: Sequence[tuple[str, str |
     shown = [method for method in methods if method in handles]
     figure.legend([handles[m] for m in shown], shown, ncols=5, fontsize=8, loc="outside upper center", frameon=False)
     axes[-1, 0].set_xlabel("observed modalities and share of the interaction")
+    return figure
+
+
+def horizons_figure(results: Mapping[str, Any], panels: Sequence[tuple[str, str | None]]) -> Figure:
+    """Means over cells by how far ahead, the end last: a panel for each (metric, modality), a line a method."""
+    tables = {grid.title: grid for grid in horizon_grids(results, panels)}
+    figure, axes = plt.subplots(
+        1, max(len(tables), 1), figsize=(4.2 * max(len(tables), 1), 3.6), squeeze=False, layout="constrained"
+    )
+    for axis, (title, grid) in zip(axes[0], tables.items(), strict=False):
+        for method, cells in grid.lines.items():
+            there = [(i, float(text)) for i, (text, _) in enumerate(cells) if text != "-"]
+            if there:
+                axis.plot(*zip(*there, strict=True), "o-", ms=4, color=colour(method), label=method)
+        axis.set_xticks(range(len(grid.columns)), grid.columns)
+        axis.set_xlabel("seconds ahead")
+        axis.set_ylabel(plain(title.removesuffix(" by seconds ahead")), fontsize=9)
+        axis.grid(alpha=0.3)
+        if title.startswith("coverage_95"):
+            axis.axhline(0.95, color="0.3", lw=0.8, ls="--")
+        else:
+            axis.set_ylim(bottom=0)
+    if tables:
+        handles, labels = axes[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, ncols=5, fontsize=8, loc="outside upper center", frameon=False)
     return figure
 
 

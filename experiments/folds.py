@@ -150,8 +150,9 @@ def interleave(parts: Sequence[Values]) -> Values:
 
 
 def mean_of_cells(values: Values, method: str, metric: str) -> float:
-    """Mean over cells and interactions of one metric of one method."""
-    cells = [methods[method] for cell, methods in values.items() if cell.metric == metric and method in methods]
+    """Mean over cells and interactions of one metric of one method, of the end."""
+    asked = [methods for cell, methods in values.items() if cell.metric == metric and cell.ahead is None]
+    cells = [methods[method] for methods in asked if method in methods]
     return float(np.mean([np.nanmean(array) for array in cells])) if cells else float("nan")
 
 

@@ -21,6 +21,8 @@ class Cell(NamedTuple):
     metric: str
     modality: str | None
     unit: str
+    ahead: float | None = None
+    """Seconds after the last sample that was shown; None: the end."""
 
 
 Values = dict[Cell, dict[str, NDArray[np.float64]]]
@@ -36,6 +38,7 @@ def summarise(values: Values, reference: str | None = None) -> dict[str, Any]:
     rows, comparisons = [], []
     for cell, methods in values.items():
         key = {"subset": cell.subset, "observed": cell.observed, "metric": cell.metric, "modality": cell.modality}
+        key |= {} if cell.ahead is None else {"ahead": cell.ahead}
         measured = {name: array[~np.isnan(array)] for name, array in methods.items()}
         measured = {name: array for name, array in measured.items() if len(array)}
         for name, array in measured.items():
@@ -57,7 +60,8 @@ def summarise(values: Values, reference: str | None = None) -> dict[str, Any]:
 def _over_cells(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     groups: dict[tuple[Any, ...], list[float]] = {}
     for row in rows:
-        groups.setdefault((row["method"], row["metric"], row["modality"], row["unit"]), []).append(row["mean"])
+        key = (row["method"], row["metric"], row["modality"], row["unit"], row.get("ahead"))
+        groups.setdefault(key, []).append(row["mean"])
     return [
         {
             "method": method,
@@ -66,22 +70,23 @@ def _over_cells(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             "unit": unit,
             "mean": sum(m) / len(m),
             "cells": len(m),
+            **({} if ahead is None else {"ahead": ahead}),
         }
-        for (method, metric, modality, unit), m in groups.items()
+        for (method, metric, modality, unit, ahead), m in groups.items()
     ]
 
 
 class Grid(NamedTuple):
-    """One table: methods down, cells across, with the mean over cells at the end.
+    """One table: methods down, cells or horizons across; of cells, with the mean over them at the end.
 
     Attributes:
-        title: metric, modality and unit.
-        columns: (subset, fraction) of each cell.
+        title: metric, modality, unit and how far ahead.
+        columns: names of the cells or horizons, of a line or two.
         lines: for each method a text for each cell, and whether it is the best.
     """
 
     title: str
-    columns: list[tuple[str, float]]
+    columns: list[str]
     lines: dict[str, list[tuple[str, bool]]]
 
 
@@ -92,18 +97,19 @@ def grids(results: Mapping[str, Any], only: Sequence[tuple[str, str | None]] | N
     significantly worse than the best of the cell.
     """
     rows, made = results["rows"], []
-    columns = list(dict.fromkeys((row["subset"], row["observed"]) for row in rows))
     differing = {
-        (c["subset"], c["observed"], c["metric"], c["modality"], c["b"])
+        (c["subset"], c["observed"], c["metric"], c["modality"], c.get("ahead"), c["b"])
         for c in results["comparisons"]
         if c["p_value"] < 0.05
     }
-    for metric, modality, unit in dict.fromkeys((row["metric"], row["modality"], row["unit"]) for row in rows):
-        if only is not None and (metric, modality) not in only:
+    kinds = dict.fromkeys((row["metric"], row["modality"], row["unit"], row.get("ahead")) for row in rows)
+    for metric, modality, unit, ahead in kinds:
+        if only is not None and ((metric, modality) not in only or ahead is not None):
             continue
-        group = [row for row in rows if (row["metric"], row["modality"]) == (metric, modality)]
-        # Millimetres where all is below a decimetre: as people speak of it.
-        factor, shown = (1e3, "mm") if unit == "m" and max(row["mean"] for row in group) < 0.1 else (1.0, unit)
+        kind = (metric, modality, ahead)
+        group = [row for row in rows if (row["metric"], row["modality"], row.get("ahead")) == kind]
+        columns = list(dict.fromkeys((row["subset"], row["observed"]) for row in group))
+        factor, shown = _unit(unit, group)
         best = {
             column: min(
                 (row["mean"] for row in group if (row["subset"], row["observed"]) == column),
@@ -125,7 +131,7 @@ def grids(results: Mapping[str, Any], only: Sequence[tuple[str, str | None]] | N
                 text = f"{factor * row['mean']:.3g}"
                 if row["standard_error"] is not None:
                     text += f" ±{factor * row['standard_error']:.1g}"
-                differs = (*column, metric, modality, method) in differing
+                differs = (*column, *kind, method) in differing
                 if results["reference"] is None:
                     text += "" if differs or first else "°"
                 else:
@@ -134,14 +140,56 @@ def grids(results: Mapping[str, Any], only: Sequence[tuple[str, str | None]] | N
             mean = next(
                 s
                 for s in results["summary"]
-                if (s["method"], s["metric"], s["modality"]) == (method, metric, modality)
+                if (s["method"], s["metric"], s["modality"], s.get("ahead")) == (method, *kind)
             )
             # A mean over fewer cells than others have would not compare with theirs.
             whole = mean["cells"] == sum(best[column] is not None for column in columns)
             lines[method] = [*cells, (f"{factor * mean['mean']:.3g}" if whole else "-", False)]
         title = " ".join(part for part in (metric, modality, f"[{shown}]") if part)
-        made.append(Grid(title, columns, lines))
+        title += "" if ahead is None else f", {ahead:g} s ahead"
+        names = [f"{subset}\n{observed:.0%}" for subset, observed in columns]
+        made.append(Grid(title, [*names, "mean of\ncells"], lines))
     return made
+
+
+def horizon_grids(results: Mapping[str, Any], only: Sequence[tuple[str, str | None]] | None = None) -> list[Grid]:
+    """A table for each metric and modality that has horizons: the means over cells, a column a horizon.
+
+    Over those cells that all horizons have, so that the columns can be compared.
+    """
+    rows, made = results["rows"], []
+    for metric, modality, unit in dict.fromkeys((row["metric"], row["modality"], row["unit"]) for row in rows):
+        group = [row for row in rows if (row["metric"], row["modality"]) == (metric, modality)]
+        horizons = sorted({row.get("ahead", math.inf) for row in group})
+        if len(horizons) < 2 or (only is not None and (metric, modality) not in only):
+            continue
+        cells = [
+            {(row["subset"], row["observed"]) for row in group if row.get("ahead", math.inf) == h} for h in horizons
+        ]
+        shared = set.intersection(*cells)
+        group = [row for row in group if (row["subset"], row["observed"]) in shared]
+        factor, shown = _unit(unit, group)
+        means: dict[str, list[float | None]] = {}
+        for method in dict.fromkeys(row["method"] for row in group):
+            mine = [row for row in group if row["method"] == method]
+            each = [[row["mean"] for row in mine if row.get("ahead", math.inf) == h] for h in horizons]
+            means[method] = [sum(m) / len(m) if len(m) == len(shared) else None for m in each]
+        best = [
+            min((m[i] for m in means.values() if m[i] is not None), key=lambda v: _badness(metric, v), default=None)  # type: ignore[arg-type]
+            for i in range(len(horizons))
+        ]
+        lines = {
+            method: [("-", False) if v is None else (f"{factor * v:.3g}", v == best[i]) for i, v in enumerate(values)]
+            for method, values in means.items()
+        }
+        title = " ".join(part for part in (metric, modality, f"[{shown}] by seconds ahead") if part)
+        made.append(Grid(title, ["end" if math.isinf(h) else f"{h:g} s" for h in horizons], lines))
+    return made
+
+
+def _unit(unit: str, rows: Sequence[Mapping[str, Any]]) -> tuple[float, str]:
+    """Factor and name: millimetres where all is below a decimetre, as people speak of it."""
+    return (1e3, "mm") if unit == "m" and max(row["mean"] for row in rows) < 0.1 else (1.0, unit)
 
 
 def legend(results: Mapping[str, Any]) -> str:
@@ -165,12 +213,11 @@ def print_tables(
     console = Console() if console is None else console
     if not console.is_terminal:
         console.width = max(console.width, 160)
-    for grid in grids(results, only):
+    for grid in (*grids(results, only), *horizon_grids(results, only)):
         table = Table(title=escape(grid.title), title_justify="left")
         table.add_column("method")
-        for subset, observed in grid.columns:
-            table.add_column(escape(f"{subset}\n{observed:.0%}"), justify="right")
-        table.add_column("mean of\ncells", justify="right")
+        for column in grid.columns:
+            table.add_column(escape(column), justify="right")
         for method, cells in grid.lines.items():
             table.add_row(escape(method), *(f"[bold]{text}[/bold]" if best else text for text, best in cells))
         console.print(table)
@@ -185,8 +232,8 @@ def _cell(text: str) -> str:
 def markdown(results: Mapping[str, Any]) -> str:
     """Every table of the results in Markdown."""
     parts = []
-    for grid in grids(results):
-        heads = ["method", *(_cell(f"{subset} {observed:.0%}") for subset, observed in grid.columns), "mean"]
+    for grid in (*horizon_grids(results), *grids(results)):
+        heads = ["method", *(_cell(column.replace("\n", " ")) for column in grid.columns)]
         lines = [f"**{grid.title}**", "", f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}"]
         for method, cells in grid.lines.items():
             texts = (f"**{text}**" if best else text.replace("*", "\\*") for text, best in cells)

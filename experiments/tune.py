@@ -30,7 +30,7 @@ from experiments.command_line import (
 )
 from experiments.data import FRACTIONS, Roles, choose_subsets, load, thinning
 from experiments.evaluate import FilterMethod, MeanMethod, NearestMethod, Task, evaluate
-from experiments.figures import forecast_figure, noise_figure, results_figure
+from experiments.figures import forecast_figure, horizons_figure, noise_figure, results_figure
 from experiments.folds import (
     LOST,
     interleave,
@@ -245,6 +245,7 @@ def main(arguments: list[str] | None = None) -> None:
         panels = [("mse", "robot"), ("mae", "ball"), ("tool_error", None)]
     panels.append(("coverage_95", task.targets[0]))
     save_figure(results_figure(results, panels), run.path / "results.png")
+    save_figure(horizons_figure(results, panels), run.path / "horizons.png")
     run.finish(results)
     print_tables(results)
     for report in results["reports"][:1]:

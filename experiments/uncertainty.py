@@ -45,7 +45,7 @@ def probabilities(method: FilterMethod, task: Task, tests: Demonstrations, targe
     stop = int(steps.max()) + 1
     within = torch.arange(stop).view(1, -1, 1) <= steps.amax(-1).view(-1, 1, 1)
     targets = tests.layout.mask([target])
-    forecast: Forecast = method(y[:, :stop], measured[:, :stop] & shown & within, steps, targets).forecast
+    forecast: Forecast = method(y[:, :stop], measured[:, :stop] & shown & within, steps, targets).forecast.at(0)
     ends = torch.stack([trajectory[-1, targets] for trajectory in tests]).unsqueeze(1)
     return forecast.probability_below(ends.expand_as(forecast.mean))
 
@@ -99,7 +99,7 @@ def main(arguments: list[str] | None = None) -> None:
     # Every sensor, at many shares of the interaction.
     subset, names = list(task.subsets.items())[-1]
     fractions = tuple(round(0.05 * i, 2) for i in range(1, 20))
-    curve = task._replace(subsets={subset: names}, fractions=fractions, skipped=[])
+    curve = task._replace(subsets={subset: names}, fractions=fractions, skipped=[], ahead=())
     values = evaluate(curve, methods, tests)
     shown = layout.mask(names)
     horizons = curve._replace(fractions=(0.2, 0.43, 0.6, 0.82))

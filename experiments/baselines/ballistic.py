@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from experiments.baselines.common import ends, point_answer, until
-from experiments.evaluate import Answer
+from experiments.evaluate import END, Answer
 from torch_ebip import Demonstrations
 
 GRAVITY = 9.81
@@ -78,8 +79,10 @@ class BallisticMethod:
         begun = torch.stack([p[0] for _, p in flights])
         self.surface = _fit_surface(begun, landed[usable], tilted)
 
-    def __call__(self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor) -> Answer:
-        """See `Method`. NaN for all but the ball, and for a ball of which fewer than `least` samples are seen."""
+    def __call__(
+        self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor, ahead: Sequence[float] = END
+    ) -> Answer:
+        """See `Method`. NaN for all but the catch, the end, and for a ball with fewer than `least` samples seen."""
         mean = y.new_full((*keep.shape, y.shape[-1]), torch.nan)
         for k in range(keep.shape[1]):
             seen = until(observed, keep[:, k])[..., self.columns].all(-1)
@@ -87,7 +90,8 @@ class BallisticMethod:
                 if int(seen[b].sum()) >= self.least:
                     positions = y[b, :, self.columns][seen[b]].double()
                     mean[b, k, self.columns] = self._catch(self._times(seen[b]), positions).to(y)
-        return point_answer(mean[..., dofs])
+        ends = torch.tensor(ahead).isinf().unsqueeze(-1)
+        return point_answer(torch.where(ends, mean[..., dofs].unsqueeze(2), torch.nan))
 
     def _times(self, seen: Tensor) -> Tensor:
         """float64 [M], s: when the samples bool [T] were taken, counted from the first that is seen."""

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from experiments.evaluate import Answer, last_measured
+from experiments.evaluate import Answer
 from torch_ebip import Demonstrations, Forecast
+from torch_ebip.learning.references import last_measured, recorded
 
 Array = NDArray[np.float64]
 
@@ -29,7 +32,22 @@ def until(observed: Tensor, keep: Tensor) -> Tensor:
 
 
 def point_answer(mean: Tensor) -> Answer:
-    """An answer [B, K, D] that knows nothing of its uncertainty or of the phase."""
+    """An answer [B, K, A, D] that knows nothing of its uncertainty or of the phase."""
     unknown = torch.full_like(mean, torch.nan)
-    phase = mean.new_full(mean.shape[:2], torch.nan)
-    return Answer(Forecast(mean, unknown, phase), phase)
+    return Answer(
+        Forecast(mean, unknown, mean.new_full(mean.shape[:3], torch.nan)), mean.new_full(mean.shape[:2], torch.nan)
+    )
+
+
+def futures(demonstrations: Demonstrations, keep: Tensor, ahead: Sequence[float], targets: Tensor) -> Tensor:
+    """[N, K, A, M], units of the DoFs: what is to be forecast, with the same rule as in `evaluate`.
+
+    Args:
+        demonstrations: N of them.
+        keep: int64 [N, K], the last sample that is shown.
+        ahead: A times in seconds after it; infinity: the end.
+        targets: bool [D], the M DoFs.
+    """
+    values, last = demonstrations.pad()[0][..., targets], ends(demonstrations)[:, targets]
+    seconds = values.new_tensor(list(ahead))
+    return recorded(values, demonstrations.lengths, last, keep, seconds, demonstrations.rate)

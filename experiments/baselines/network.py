@@ -55,13 +55,13 @@ class Data:
     Attributes:
         features: [every, N, S, 3 I], see `features_of`; entry o has o + 1 samples in its first stretch.
         lengths: [N] samples.
-        ends: [N, M], the targets.
+        futures: [N, T, M], the targets after each sample; NaN where there is nothing to be forecast.
         subsets: bool [subsets, I].
     """
 
     features: Tensor
     lengths: Tensor
-    ends: Tensor
+    futures: Tensor
     subsets: Tensor
 
 
@@ -110,12 +110,12 @@ def train(
     # Initial weights and dropout have no generator of their own; nobody else's draws may change for it.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        network = _Network(data.subsets.shape[-1], data.ends.shape[-1], settings.hidden, settings.dropout)
+        network = _Network(data.subsets.shape[-1], data.futures.shape[-1], settings.hidden, settings.dropout)
         optimiser = torch.optim.AdamW(
             network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
         )
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.steps)
-        best = [Trained(copy.deepcopy(network), torch.ones(data.ends.shape[-1])) for _ in data.subsets]
+        best = [Trained(copy.deepcopy(network), torch.ones(data.futures.shape[-1])) for _ in data.subsets]
         best_loss, waited = [float("inf")] * len(best), 0
         for step in range(1, settings.steps + 1):
             network.train()
@@ -123,14 +123,14 @@ def train(
             subset = data.subsets[torch.randint(len(data.subsets), (len(chosen),), generator=generator)]
             first = torch.randint(1, every + 1, (len(chosen),), generator=generator)
             subset = subset & (torch.rand(subset.shape, generator=generator) >= settings.hidden_inputs)
-            features, weight = _batch(data, chosen, subset, first, every, settings.earliest)
+            features, target, weight = _batch(data, chosen, subset, first, every, settings.earliest)
             noise = settings.noise * torch.randn(features.shape, generator=generator)
             noise += settings.bias * torch.randn(len(features), 1, features.shape[-1], generator=generator)
             # Zeros are what is not shown or not measured yet: there is no noise without a sensor.
             mean, log_variance = network(features + noise * (features != 0))
-            squares = _squares(mean, data.ends[chosen])
+            squares = _squares(mean, target)
             likelihood = 0.5 * (log_variance + squares.detach() * torch.exp(-log_variance))
-            loss = _average(squares + likelihood, weight, data.ends[chosen])
+            loss = _average(squares + likelihood, weight, target)
             optimiser.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -155,19 +155,18 @@ def _held_out(
     """Mean squared error with a subset of sensors, bool [I], and for each target squared error over variance [M]."""
     network.eval()
     first = torch.full_like(chosen, every)
-    features, weight = _batch(data, chosen, subset.expand(len(chosen), -1), first, every, earliest)
+    features, target, weight = _batch(data, chosen, subset.expand(len(chosen), -1), first, every, earliest)
     mean, log_variance = network(features)
-    target = data.ends[chosen]
     squares = _squares(mean, target)
-    weights = weight.unsqueeze(-1) * ~target.isnan().unsqueeze(1)
+    weights = weight.unsqueeze(-1) * ~target.isnan()
     ratio = (squares * torch.exp(-log_variance) * weights).sum((0, 1)) / weights.sum((0, 1)).clamp(min=1e-9)
     return float(_average(squares, weight, target)), torch.where(ratio > 0, ratio, 1.0)
 
 
 def _batch(
     data: Data, chosen: Tensor, subset: Tensor, first: Tensor, every: int, earliest: float
-) -> tuple[Tensor, Tensor]:
-    """Features [B, S, 3 I] and weights [B, S] that sum to one a demonstration.
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Features [B, S, 3 I], targets [B, S, M] and weights [B, S] that sum to one a demonstration.
 
     Args:
         data: to choose from.
@@ -184,16 +183,16 @@ def _batch(
     counted = (stops <= lengths.unsqueeze(-1)) & (stops >= earliest * lengths.unsqueeze(-1))
     # Where nothing is measured yet there is nothing to learn but the mean; that is left in, since it is asked for.
     weight = counted / counted.sum(-1, keepdim=True).clamp(min=1)
-    return features, weight
+    last = (torch.minimum(stops, lengths.unsqueeze(-1)) - 1).clamp(min=0)
+    return features, data.futures[chosen.unsqueeze(-1), last], weight
 
 
 def _squares(mean: Tensor, target: Tensor) -> Tensor:
-    """Squared errors [B, S, M] of mean [B, S, M] for target [B, M], 0 where the target was not measured."""
-    target = target.unsqueeze(1)
+    """Squared errors [B, S, M] of mean [B, S, M] for target [B, S, M], 0 where the target was not measured."""
     return torch.where(target.isnan(), 0.0, mean - target.nan_to_num()).square()
 
 
 def _average(loss: Tensor, weight: Tensor, target: Tensor) -> Tensor:
     """Mean of loss [B, S, M] over what was measured of target [B, M], steps weighted by [B, S]."""
-    weights = weight.unsqueeze(-1) * ~target.isnan().unsqueeze(1)
+    weights = weight.unsqueeze(-1) * ~target.isnan()
     return (loss * weights).sum() / weights.sum().clamp(min=1e-9)

@@ -1,21 +1,21 @@
-"""A recurrent network that reads the sensors and says where the interaction will end: what deep learning offers."""
+"""A recurrent network that reads the sensors and says what will be: what deep learning offers."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
-from experiments.baselines.common import ends, until
+from experiments.baselines.common import futures, until
 from experiments.baselines.network import Data, RecurrentSettings, Trained, train
 from experiments.baselines.stretches import all_features, cumulative, features_of, moments
-from experiments.evaluate import Answer
+from experiments.evaluate import END, Answer
 from torch_ebip import Demonstrations, Forecast
 
 
 class RecurrentMethod:
-    """A few small GRUs that forecast the end at every step; trained when made, one set for all sensors.
+    """A few small GRUs that forecast what is asked at every step; trained when made, one set for all sensors.
 
     They see the standardised means of short stretches of samples (the one before where nothing was measured, 0 before
     the first), whether there were any, and the change from one stretch to the next. Every batch shows random ones of
@@ -25,9 +25,10 @@ class RecurrentMethod:
 
     Args:
         demonstrations: of the training part.
-        targets: bool [D], DoFs whose last value is learned.
+        targets: bool [D], DoFs whose values are learned.
         subsets: the sensors that will be shown together, bool [D] by name.
         settings: of building and training.
+        ahead: how many seconds later, A times; infinity: the end.
 
     Raises:
         ValueError: fewer than two demonstrations a network, or no subset.
@@ -39,13 +40,14 @@ class RecurrentMethod:
         targets: Tensor,
         subsets: Mapping[str, Tensor],
         settings: RecurrentSettings | None = None,
+        ahead: Sequence[float] = END,
     ) -> None:
         self.settings = settings = RecurrentSettings() if settings is None else settings
         if len(demonstrations) < 2 * max(5, settings.networks):
             raise ValueError(f"{len(demonstrations)} demonstrations are too few for {settings.networks} networks")
         if not subsets:
             raise ValueError("at least one subset of sensors is needed, got none")
-        self.targets = targets
+        self.targets, self.ahead = targets, tuple(ahead)
         # The network has no use for inputs that are in no subset.
         self.inputs = torch.stack(list(subsets.values())).any(0)
         subset_masks = torch.stack([mask[self.inputs] for mask in subsets.values()])
@@ -53,12 +55,14 @@ class RecurrentMethod:
         values, measured = demonstrations.pad()
         values, measured = values[..., self.inputs].float(), measured[..., self.inputs]
         self._center, self._scale = moments(values.flatten(0, 1), measured.flatten(0, 1))
-        final = ends(demonstrations)[:, targets].float()
-        self._target_center, self._target_scale = moments(final, ~final.isnan())
+        every = torch.arange(values.shape[1]).expand(len(demonstrations), -1)
+        every = torch.minimum(every, demonstrations.lengths.unsqueeze(-1) - 1)
+        later = futures(demonstrations, every, self.ahead, targets).flatten(-2).float()
+        self._target_center, self._target_scale = moments(later.flatten(0, 1), ~later.flatten(0, 1).isnan())
         data = Data(
             all_features((values - self._center) / self._scale, measured, self.every),
             demonstrations.lengths,
-            (final - self._target_center) / self._target_scale,
+            (later - self._target_center) / self._target_scale,
             subset_masks,
         )
         generator = torch.Generator().manual_seed(settings.seed)
@@ -71,12 +75,17 @@ class RecurrentMethod:
             self._networks.append(trained)
 
     @torch.no_grad()
-    def __call__(self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor) -> Answer:
+    def __call__(
+        self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor, ahead: Sequence[float] = END
+    ) -> Answer:
         """See `Method`.
 
         Raises:
-            ValueError: DoFs are asked for that are no targets.
+            ValueError: DoFs are asked for that are no targets, or seconds that were not learned.
         """
+        strange = [a for a in ahead if a not in self.ahead]
+        if strange:
+            raise ValueError(f"{strange} s ahead were not learned, only {list(self.ahead)}")
         if (dofs & ~self.targets).any():
             raise ValueError("DoFs are asked for that were not among the targets")
         values = (y[..., self.inputs].float() - self._center) / self._scale
@@ -86,10 +95,13 @@ class RecurrentMethod:
             for k in range(keep.shape[1])
         ]
         means, variances = zip(*forecasts, strict=True)
-        wanted = dofs[self.targets]
-        mean, variance = (torch.stack(part, 1)[..., wanted].to(y) for part in (means, variances))
+        wanted, asked = dofs[self.targets], [self.ahead.index(a) for a in ahead]
+        shape = (*keep.shape, len(self.ahead), -1)
+        mean, variance = (
+            torch.stack(part, 1).view(shape)[..., asked, :][..., wanted].to(y) for part in (means, variances)
+        )
         one = torch.ones_like(mean[..., 0])
-        return Answer(Forecast(mean, variance, one), torch.full_like(one, torch.nan))
+        return Answer(Forecast(mean, variance, one), torch.full_like(one[..., 0], torch.nan))
 
     def _forecast(self, values: Tensor, seen: Tensor, stop: Tensor, shown: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance [B, M], in units of the targets, from the samples before stop [B] of sensors bool [I]."""

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from experiments.baselines.common import Array, ends, kept_steps, point_answer, until
-from experiments.evaluate import Answer
+from experiments.baselines.common import Array, futures, kept_steps, point_answer, until
+from experiments.evaluate import END, Answer
 from torch_ebip import Demonstrations
 
 ALPHAS = tuple(float(alpha) for alpha in np.logspace(-1, 5, 25))
@@ -28,34 +28,48 @@ class _RegressionMethod(ABC):
 
     Args:
         demonstrations: of the training part.
-        targets: bool [D], DoFs whose last value is learned.
+        targets: bool [D], DoFs whose values are learned.
         fractions: shares of an interaction at which it will be asked: column k of `keep` is fractions[k].
+        ahead: how many seconds later, A times; infinity: the end.
     """
 
-    def __init__(self, demonstrations: Demonstrations, targets: Tensor, fractions: Sequence[float]) -> None:
+    def __init__(
+        self,
+        demonstrations: Demonstrations,
+        targets: Tensor,
+        fractions: Sequence[float],
+        ahead: Sequence[float] = END,
+    ) -> None:
         _require_sklearn()
-        self.targets, self.fractions = targets, tuple(fractions)
+        self.targets, self.fractions, self.ahead = targets, tuple(fractions), tuple(ahead)
+        self._demonstrations = demonstrations
         self._values, self._measured = demonstrations.pad()
         self._lengths, self._rate = demonstrations.lengths, demonstrations.rate
-        self._ends = ends(demonstrations)[:, targets].double().numpy()
         self._fitted: dict[tuple[tuple[bool, ...], float], _Regression] = {}
 
-    def __call__(self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor) -> Answer:
+    def __call__(
+        self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor, ahead: Sequence[float] = END
+    ) -> Answer:
         """See `Method`.
 
         Raises:
-            ValueError: `keep` has not one column a fraction; DoFs are asked for that are no targets.
+            ValueError: `keep` has not one column a fraction; DoFs are asked for that are no targets, or seconds that
+                were not learned.
         """
         if keep.shape[1] != len(self.fractions):
             raise ValueError(f"keep has {keep.shape[1]} columns for the {len(self.fractions)} fractions")
         if (dofs & ~self.targets).any():
             raise ValueError("DoFs are asked for that were not among the targets")
+        strange = [a for a in ahead if a not in self.ahead]
+        if strange:
+            raise ValueError(f"{strange} s ahead were not learned, only {list(self.ahead)}")
         shown = observed.any(0).any(0)
         means = []
         for k, fraction in enumerate(self.fractions):
             regression = self.fit(shown, fraction)
             features = self._features(y[..., shown], until(observed, keep[:, k])[..., shown], keep[:, k])
-            means.append(torch.from_numpy(regression.predict(features)).to(y))
+            said = torch.from_numpy(regression.predict(features)).to(y).view(len(y), len(self.ahead), -1)
+            means.append(said[:, [self.ahead.index(a) for a in ahead]])
         return point_answer(torch.stack(means, 1)[..., dofs[self.targets]])
 
     def fit(self, shown: Tensor, fraction: float) -> _Regression:
@@ -65,7 +79,9 @@ class _RegressionMethod(ABC):
             keep = kept_steps(self._lengths, fraction)
             seen = until(self._measured, keep)[..., shown]
             features = self._features(self._values[..., shown], seen, keep)
-            self._fitted[key] = _Regression(self._regressor, features, self._ends)
+            wanted = futures(self._demonstrations, keep.unsqueeze(-1), self.ahead, self.targets).flatten(1)
+            # What lies behind the end for nearly all cannot be learned; the mean of the few is all that is said.
+            self._fitted[key] = _Regression(self._regressor, features, wanted.double().numpy())
         return self._fitted[key]
 
     @abstractmethod
@@ -100,7 +116,7 @@ class TreesMethod(_RegressionMethod):
     first measured; and the elapsed time.
 
     Args:
-        demonstrations, targets, fractions: see `_RegressionMethod`.
+        demonstrations, targets, fractions, ahead: see `_RegressionMethod`.
         points: of the prefix, the first and the last sample among them.
         window: s.
         trees: how many.
@@ -114,6 +130,7 @@ class TreesMethod(_RegressionMethod):
         demonstrations: Demonstrations,
         targets: Tensor,
         fractions: Sequence[float],
+        ahead: Sequence[float] = END,
         points: int = 8,
         window: float = 0.1,
         trees: int = 200,
@@ -121,7 +138,7 @@ class TreesMethod(_RegressionMethod):
         min_samples_leaf: int = 2,
         seed: int = 0,
     ) -> None:
-        super().__init__(demonstrations, targets, fractions)
+        super().__init__(demonstrations, targets, fractions, ahead)
         self.points, self.window, self.seed = points, window, seed
         self.trees, self.max_features, self.min_samples_leaf = trees, max_features, min_samples_leaf
 

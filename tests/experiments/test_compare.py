@@ -32,14 +32,19 @@ def finished(recordings: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_table_has_every_cell(finished: Path) -> None:
     results = json.loads((finished / "results.json").read_text())
-    rows = results["rows"]
+    rows = [row for row in results["rows"] if "ahead" not in row]
+    later = [row for row in results["rows"] if "ahead" in row]
+    assert {(row["ahead"], row["method"]) for row in later} >= {
+        (ahead, method) for ahead in (0.1, 0.25, 0.5) for method in FEW[1:]
+    }
     assert {row["method"] for row in rows} == set(FEW[1:])
     assert {(row["subset"], row["observed"]) for row in rows} == {
         (subset, fraction) for subset in ("hand", "gaze", "all") for fraction in (0.43, 0.82)
     }
     assert all(row["n"] == 30 for row in rows)
     assert set(results["seconds_by_method"]) == set(FEW[1:])
-    best = {(c["subset"], c["observed"], c["metric"], c["modality"]): c["a"] for c in results["comparisons"]}
+    ends = [c for c in results["comparisons"] if "ahead" not in c]
+    best = {(c["subset"], c["observed"], c["metric"], c["modality"]): c["a"] for c in ends}
     for key, name in best.items():
         means = {
             r["method"]: r["mean"] for r in rows if (r["subset"], r["observed"], r["metric"], r["modality"]) == key
@@ -49,6 +54,8 @@ def test_the_table_has_every_cell(finished: Path) -> None:
     assert (finished / "results.png").stat().st_size > 10_000
     text = (finished / "results.md").read_text()
     assert "**mae arm [" in text
+    assert "by seconds ahead**" in text
+    assert (finished / "horizons.png").stat().st_size > 10_000
     assert "| `ebip_tuned` |" in text
 
 

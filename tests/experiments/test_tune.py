@@ -49,7 +49,15 @@ def finished(recordings: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_run_folder_is_complete(finished: Path) -> None:
     names = {path.name for path in finished.iterdir()}
-    assert {"config.json", "results.json", "results.png", "forecasts.png", "noise.png", "checkpoint.pt"} <= names
+    assert {
+        "config.json",
+        "results.json",
+        "results.png",
+        "horizons.png",
+        "forecasts.png",
+        "noise.png",
+        "checkpoint.pt",
+    } <= names
     assert {"model.safetensors", "report.json", "learning.json", "basis.txt"} <= names
     assert list((finished / "tensorboard").glob("events*"))
     results = json.loads((finished / "results.json").read_text())
@@ -58,7 +66,8 @@ def test_a_run_folder_is_complete(finished: Path) -> None:
     assert methods == {"mean", "nearest", "ebip", "ebip_scaled", "ebip_tuned"}
     assert {row["observed"] for row in results["rows"]} == {0.43, 0.82}
     assert {row["metric"] for row in results["rows"]} == {"mse", "mae", "coverage_95", "crps", "phase_error"}
-    assert all(row["n"] == 6 for row in results["rows"])
+    assert all(row["n"] == 6 for row in results["rows"] if "ahead" not in row)
+    assert {row["ahead"] for row in results["rows"] if "ahead" in row} >= {0.1, 0.25, 0.5}
 
 
 def test_a_finished_run_stops(finished: Path, recordings: str) -> None:
@@ -73,6 +82,7 @@ def test_a_run_folder_holds_the_model_of_its_table(finished: Path, recordings: s
     task = Task({"all": ["hand", "gaze"]}, (0.43, 0.82), [], ["arm"], {}, None)
     values = evaluate(task, {"ebip_tuned": method}, demonstrations.subset(testing))
     rows = json.loads((finished / "results.json").read_text())["rows"]
+    rows = [row for row in rows if "ahead" not in row]
     for cell, methods in values.items():
         row = next(
             r for r in rows if (r["method"], r["metric"], r["observed"]) == ("ebip_tuned", cell.metric, cell.observed)
@@ -117,7 +127,7 @@ def test_a_killed_run_resumes_to_the_same_table(tmp_path: Path) -> None:
     subprocess.run([*command, str(tmp_path / "whole")], cwd=root, check=True, capture_output=True)
     resumed, whole = (json.loads((path / "results.json").read_text()) for path in (run, tmp_path / "whole"))
     assert resumed["rows"] == whole["rows"]
-    assert all(row["n"] == 20 for row in whole["rows"])
+    assert all(row["n"] == 20 for row in whole["rows"] if "ahead" not in row)
 
 
 def test_test_interactions_are_seen_by_nobody() -> None:
@@ -180,7 +190,7 @@ def test_the_simulated_task_has_the_papers_nine_cells() -> None:
         ("phase_error", None, "1"),
     } <= metrics
     # The squared error is of the first three joints, the tool's through forward kinematics.
-    cell = next(c for c in values if (c.metric, c.modality, c.subset, c.observed) == ("mse", "robot", "ball", 0.82))
+    cell = next(c for c in values if tuple(c) == ("ball", 0.82, "mse", "robot", "rad^2", None))
     method = FilterMethod(tunable(primitive, Start(100.0, 10.0)), 0)
     y, measured = tests.pad()
     steps = (tests.lengths * 0.82).round().long().unsqueeze(-1) - 1
@@ -192,7 +202,7 @@ def test_the_simulated_task_has_the_papers_nine_cells() -> None:
         & (torch.arange(length).view(1, -1, 1) <= steps.unsqueeze(-1))
     )
     answer = method(y[:, :length], shown, both, tests.layout.mask(task.targets))
-    robot = answer.forecast.mean[:, 1, 3:]
+    robot = answer.forecast.mean[:, 1, 0, 3:]
     truth = torch.stack([trajectory[-1, tests.layout.slice("robot")] for trajectory in tests])
     np.testing.assert_allclose(values[cell]["ebip_tuned"], (robot - truth)[:, :3].square().mean(-1), rtol=1e-4)
     tool = next(c for c in values if (c.metric, c.subset, c.observed) == ("tool_error", "ball", 0.82))

@@ -12,16 +12,21 @@ def draws(*shape: int, seed: int) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def test_weights_are_those_of_the_formula() -> None:
+@pytest.mark.parametrize(
+    ("sharpness", "rates", "slope"),
+    [([3.0], [4.0], 1.5), ([3.0, 2.0], [4.0, 0.5], 1.5), ([0.5, 1.0, 2.0], [6.0, 1.0, 0.01], 2.0)],
+)
+def test_weights_are_those_of_the_formula(sharpness: list[float], rates: list[float], slope: float) -> None:
     variance = torch.tensor([0.5, 2.0, 4.0], dtype=torch.float64)
     table = DemonstrationTable(draws(7, 5, 3, seed=2), draws(7, 5, 3, seed=3))
     module = EvidenceWeighting(
         table,
         variance,
         torch.tensor([0, 0, 1]),
-        3.0,
-        forgetting=4.0,
-        slope=1.5,
+        sharpness,
+        forgetting=rates,
+        slope=slope,
+        primacy=0.7,
         wander=0.1,
         offsets=(-0.1, 0.0, 0.2),
     )
@@ -32,11 +37,13 @@ def test_weights_are_those_of_the_formula() -> None:
     observed = np.array([[1, 1, 1], [1, 0, 1], [0, 0, 0], [0, 1, 0], [1, 1, 1]], dtype=bool)
     dt, phases = 0.1, torch.linspace(0.1, 0.9, 5, dtype=torch.float64)
     evidence = module.start(torch.arange(7))
-    misfit, seen, weights = np.zeros(7), 0.0, np.full(7, 1 / 7)
+    M = len(rates)
+    misfit, seen, weights = np.zeros((M, 7)), np.zeros(M), np.full(7, 1 / 7)
     for t in range(5):
         if t:
             evidence = module.forget(evidence, torch.tensor(dt, dtype=torch.float64))
-            misfit, seen = misfit * np.exp(-4.0 * dt), seen * np.exp(-4.0 * dt)
+            keep = np.exp(-np.array(rates) * dt)
+            misfit, seen = misfit * keep[:, None], seen * keep
         shown = torch.tensor(observed[t])
         value = torch.where(shown, y[t], torch.nan)
         mean = torch.stack([phases[t], torch.tensor(0.5).double()])
@@ -44,11 +51,13 @@ def test_weights_are_those_of_the_formula() -> None:
         evidence = module.compare(evidence, projections[t], sample)
         if observed[t].any():
             squares = (projections[t] - y[t]).numpy() ** 2 * factor / variance.numpy()
-            temper = 0.5 * 3.0 * np.exp(1.5 * (phases[t].item() - 0.5))
+            tempers = 0.5 * np.array(sharpness) * np.exp(slope * (phases[t].item() - 0.5))
+            temper = tempers.sum()
             prior = np.exp([-0.5, 0.0, -2.0])
             likelihood = np.exp(-temper * squares[..., observed[t]].mean(-1)) @ (prior / prior.sum())
-            misfit, seen = misfit - np.log(likelihood) / temper, seen + 1
-            logits = -misfit / seen * temper
+            held = np.exp(-0.7 * (phases[t].item() - 0.5))
+            misfit, seen = misfit - held * np.log(likelihood) / temper, seen + held
+            logits = -(tempers[:, None] * misfit / np.maximum(seen, 1)[:, None]).sum(0)
             soft = np.exp(logits - logits.max())
             weights = 0.98 * soft / soft.sum() + 0.02 / 7
         np.testing.assert_allclose(evidence.weights.detach().numpy(), weights, atol=1e-12, err_msg=f"sample {t}")
@@ -60,7 +69,7 @@ def test_a_share_outside_the_interval_is_refused() -> None:
             weighting(defensive=share)
 
 
-def weighting(**options: float) -> EvidenceWeighting:
+def weighting(**options: float | list[float]) -> EvidenceWeighting:
     return EvidenceWeighting(
         DemonstrationTable(torch.zeros(3, 5, 2), torch.zeros(3, 5, 2)),
         torch.ones(2),
@@ -84,3 +93,46 @@ def test_a_sample_is_compared_with_the_demonstration_near_the_members_phase() ->
     seen = Seen(torch.ones(1), None, None, torch.tensor([1]), moving, moving[0], origin)
     weights = module.learn(module.start(origin), seen).weights
     assert weights[0] == weights[2] > 10 * weights[1]
+
+
+def test_a_gradient_reaches_every_memory() -> None:
+    """From a start that hears the fast one alone nearly: the slow one can still be turned up."""
+    table = DemonstrationTable(draws(6, 5, 2, seed=2), 0 * draws(6, 5, 2, seed=2))
+    module = EvidenceWeighting(
+        table, torch.ones(2).double(), torch.tensor([0, 0]), [10.0, 0.01], forgetting=[6.0, 0.01]
+    )
+    origin, memory = torch.arange(6), module.start(torch.arange(6))
+    for t, y in enumerate(draws(8, 2, seed=4)):
+        memory = module.forget(memory, torch.tensor(0.1).double()) if t else memory
+        moving = torch.tensor([0.1 * t, 0.5]).double().expand(6, 2)
+        memory = module.learn(memory, Seen(y, None, None, None, moving, moving[0], origin))
+    (memory.weights * torch.arange(6)).sum().backward()
+    for parameter in (module.sharpness.raw, module.forgetting.raw, module.slope.raw, module.primacy.raw):
+        assert parameter.grad is not None
+        assert (parameter.grad != 0).all()
+        assert parameter.grad.isfinite().all()
+
+
+def test_what_was_seen_first_is_remembered_or_not() -> None:
+    """One demonstration fits the beginning, the other the rest: the fast memory takes that, the slow one neither."""
+    table = DemonstrationTable(torch.stack([torch.zeros(5, 1), torch.ones(5, 1)]), torch.zeros(2, 5, 1))
+    said = {}
+    for name, rate in (("fast", 6.0), ("slow", 0.001)):
+        module = EvidenceWeighting(table, torch.ones(1), torch.tensor([0]), forgetting=rate)
+        origin = torch.arange(2)
+        memory = module.start(origin)
+        for t in range(20):
+            memory = module.forget(memory, torch.tensor(0.1)) if t else memory
+            moving = torch.tensor([0.5, 0.5]).expand(2, 2)
+            y = torch.tensor([0.0 if t < 10 else 1.0])
+            memory = module.learn(memory, Seen(y, None, None, None, moving, moving[0], origin))
+        said[name] = memory.weights[1].item()
+    assert said["fast"] > 0.9
+    assert said["slow"] == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_sharpness_for_each_memory_is_asked_for() -> None:
+    with pytest.raises(ValueError, match="sharpness must be one number for each memory, got 3 for 2 rates"):
+        weighting(sharpness=[1.0, 2.0, 3.0], forgetting=[6.0, 0.1])
+    with pytest.raises(ValueError, match="forgetting must be a positive number, got 0"):
+        weighting(forgetting=[6.0, 0.0])

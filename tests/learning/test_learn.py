@@ -1,6 +1,7 @@
 """The recipe: what it returns, on how little it works, how it goes on, and what it refuses."""
 
 import json
+import math
 import os
 import signal
 import threading
@@ -27,12 +28,14 @@ from torch_ebip import (
     select_basis,
 )
 from torch_ebip.learning.configuration import Task
+from torch_ebip.learning.drawing import learn_drawing
 from torch_ebip.learning.held_out import HeldOut
+from torch_ebip.learning.horizons import AHEAD
 from torch_ebip.learning.objective import ForecastObjective
 from torch_ebip.learning.references import nearest
-from torch_ebip.learning.stages import learn_shrinkage, reference_scores, score
+from torch_ebip.learning.stages import reference_scores, score
 from torch_ebip.learning.starts import FACTORS, best_factor, best_start, scaled, tunable
-from torch_ebip.recordings import example
+from torch_ebip.recordings import actions, example
 
 QUICK = {"steps": 4, "scan": 6, "batch_size": 4, "validate_every": 2}
 
@@ -48,7 +51,7 @@ def test_it_is_the_recipe_step_by_step() -> None:
     model = learn(known, shrink=False, **QUICK)
     primitive = InteractionPrimitive.fit(known, select_basis(known))
     targets = known.layout.controlled
-    task = Task(primitive, ForecastObjective(primitive, targets), targets, {"all": ~targets})
+    task = Task(primitive, ForecastObjective(primitive, targets, ahead=AHEAD), targets, {"all": ~targets})
     settings = TuningSettings(steps=4, batch_size=4, validate_every=2, thinning=3)
     assert settings.thinning == model.report["settings"]["settings"]["thinning"]
     held_out = HeldOut(known, task, settings)
@@ -69,22 +72,27 @@ def test_it_is_the_recipe_step_by_step() -> None:
 
 
 def test_references_against_plain_numpy() -> None:
-    """The mean of the other folds' ends, and the nearest of the other folds' demonstrations."""
+    """The mean of the other folds' demonstrations, and the nearest of them, where they are so much later."""
     known = interactions(12, dtype=torch.float64)
     primitive = InteractionPrimitive.fit(known)
     targets = known.layout.controlled
-    task = Task(primitive, ForecastObjective(primitive, targets), targets, {"all": ~targets})
+    ahead = (0.25, 0.4, math.inf)
+    task = Task(primitive, ForecastObjective(primitive, targets, ahead=ahead), targets, {"all": ~targets})
     held_out = HeldOut(known, task, TuningSettings(folds=3, thinning=1))
     some = torch.arange(12)
     mean, near = reference_scores(held_out, some)
-    ends = primitive.basis.project(torch.ones(12, dtype=torch.float64), primitive.weights)[:, targets].numpy()
     scale = task.objective.scale.numpy()
     members = held_out.partition.members(some, torch.Generator()).numpy()
     assert all(i not in members[i] for i in range(12))
-    errors = np.stack([(ends[members[i]].mean(0) - ends[i]) / scale for i in range(12)])
-    assert mean["error"] == pytest.approx(np.sqrt((errors**2).mean()))
-    squares = []
     deviation = primitive.value_variance.sqrt().numpy()
+
+    def at(j: int, seconds: float) -> np.ndarray:
+        """Where a demonstration is, by its own regression."""
+        phase = min(1.0, seconds * float(primitive.phase_velocity[j])) if math.isfinite(seconds) else 1.0
+        one = torch.tensor(phase, dtype=torch.float64)
+        return primitive.basis.project(one, primitive.weights[j])[targets].numpy()
+
+    squares: dict[str, list[list[np.ndarray]]] = {"mean": [[], [], []], "near": [[], [], []]}
     for i in range(12):
         for share in held_out.shares.tolist():
             last = round(share * (len(known[i]) - 1))
@@ -94,8 +102,23 @@ def test_references_against_plain_numpy() -> None:
                 path = primitive.basis.project(phase, primitive.weights[j].expand(last + 1, -1)).numpy()
                 gap = ((path - known[i][: last + 1].numpy()) / deviation)[:, ~targets.numpy()]
                 distances.append(np.nansum(gap**2))
-            squares.append(((ends[members[i][np.argmin(distances)]] - ends[i]) / scale) ** 2)
-    assert near["error"] == pytest.approx(np.sqrt(np.mean(squares)))
+            closest = members[i][np.argmin(distances)]
+            for p, seconds in enumerate(ahead):
+                step = last + seconds * known.rate
+                if math.isfinite(seconds) and step > len(known[i]) - 1 + 1e-6:
+                    continue  # behind its end
+                low = min(int(step + 1e-6), len(known[i]) - 1) if math.isfinite(seconds) else -1
+                part = step - low if math.isfinite(seconds) else 0.0
+                truth = known[i][low].numpy() * (1 - part) + (known[i][low + 1].numpy() * part if part > 1e-6 else 0)
+                time = last / known.rate + seconds
+                mean_there = np.mean([at(j, time) for j in members[i]], 0)
+                for name, value in (("mean", mean_there), ("near", at(closest, time))):
+                    squares[name][p].append(((value - truth[targets.numpy()]) / scale[p]) ** 2)
+    for name, scores in (("mean", mean), ("near", near)):
+        each = [np.mean(values) for values in squares[name]]
+        assert scores["error"] == pytest.approx(np.sqrt(np.mean(each)), rel=2e-3)  # the table is a spline
+        for label, value in zip(("0.25 s", "0.4 s", "end"), each, strict=True):
+            assert scores[f"error/{label}"] == pytest.approx(np.sqrt(value), rel=2e-3)
     assert nearest(
         primitive, known.pad()[0], known.pad()[1], (known.lengths - 1).unsqueeze(-1), 1 / known.rate
     ).flatten().tolist() == list(range(12))
@@ -118,19 +141,22 @@ def test_shrinkage_finds_what_sensors_do_not_tell() -> None:
     some = torch.arange(40)
     found, gains = {}, {}
     for sensor in ("noise", "hand"):
-        task = Task(primitive, ForecastObjective(primitive, targets), targets, {sensor: layout.mask([sensor])})
+        objective = ForecastObjective(primitive, targets, ahead=[0.1, 0.5, math.inf])
+        task = Task(primitive, objective, targets, {sensor: layout.mask([sensor])})
         held_out = HeldOut(known, task, TuningSettings(thinning=2))
         filter = ebip(primitive, square_root=True, residual_variance=primitive.residual_variance)
-        drawn = learn_shrinkage(held_out, filter, some, some)
+        drawn = learn_drawing(held_out, filter, some, some)
         mean, _ = reference_scores(held_out, some)
         before = score(held_out, filter, some)["error"]
-        assert drawn.error <= 1.02 * before  # shares of each fold are learned on the others
-        assert drawn.error <= 1.05 * mean["error"]
+        assert drawn.scores["error"] <= 1.02 * before  # shares of each fold are learned on the others
+        assert drawn.scores["error"] <= 1.05 * mean["error"]
+        assert 0.88 < drawn.scores["coverage_95"] <= 0.99
         gains[sensor] = drawn.gain
-        found[sensor] = float(drawn.readout.share[-1, -2])
+        found[sensor] = drawn.shares["arm"]["end"]
         assert drawn.readout.share[:5].eq(1).all()
+        assert drawn.readout.widening[:5].eq(1).all()
         assert list(drawn.shares) == ["arm"]
-    assert gains["noise"] < 2.5 < gains["hand"]
+    assert max(gains["noise"].values()) < 2.5 < min(gains["hand"].values())
     assert found["noise"] < 0.3
     assert found["hand"] > 0.8
 
@@ -290,8 +316,11 @@ def degrees(known: Demonstrations) -> Demonstrations:
         (lambda: learn(interactions(8), joints="arm"), "joints='arm' without an arm"),
         (lambda: learn(interactions(8), subsets={"a": ["arm"]}), "subsets name arm; the sensors are hand, gaze"),
         (lambda: learn(interactions(8), pulll=1.0), "no setting pulll; there are batch_size"),
+        (lambda: learn(interactions(8), ahead=[0.5, 0.1, math.inf]), "ahead must be increasing seconds"),
+        (lambda: learn(interactions(8), ahead=[0.1, 0.5]), "the end.* the last"),
+        (lambda: learn(interactions(8), memories=3), "memories must be 1 or 2, got 3"),
         (lambda: learn(interactions(8), steps=-1), "steps must be at least 0"),
-        (lambda: learn(still(interactions(8))), r"end differently in different demonstrations, got \['arm.2'\]"),
+        (lambda: learn(still(interactions(8))), r"differ in different demonstrations, got \['arm.2'\]"),
         (lambda: learn(interactions(8), arm=RobotArm.ur5()), "no target is the arm's 6 joints .*arm has 2 DoFs"),
         (lambda: learn(degrees(example()), arm=RobotArm.ur5()), "'shoulder_pan_joint' is in 'rad', but .* 'deg'"),
     ],
@@ -333,3 +362,52 @@ def test_a_tuner_finds_out_itself_what_is_left_out() -> None:
     assert tuner.run().validation
     only = ForecastObjective(primitive, torch.tensor([False, False, False, True, False]))
     assert Tuner(made, interactions(), objective=only).targets.tolist() == [False, False, False, True, False]
+
+
+def test_horizons_that_hardly_anybody_reaches_are_left_out_and_the_report_says_so(model) -> None:
+    """The demonstrations last 1.2 to 2 s, of which 1 s is too much after the first fifth."""
+    assert model.report["horizons"] == ["0.1 s", "0.25 s", "0.5 s", "1 s", "end"]
+    far = learn(interactions(8), ahead=[0.25, 30.0, math.inf], scan=4)
+    assert far.report["horizons"] == ["0.25 s", "end"]
+    assert "hardly any demonstration goes on for so long: 30 s" in str(far.report)
+    assert {key for key in far.report["stages"]["mean"] if key.startswith("error/")} == {"error/0.25 s", "error/end"}
+
+
+def test_labels_are_recognised_and_reported() -> None:
+    known = actions(24, 5)
+    model = learn(known, **QUICK)
+    said = model.report["recognition"]
+    assert said["labels"] == {"lift": 6, "swing": 6, "circle": 6, "nod": 6}
+    assert said["accuracy_by_share"]["0.4"] > 0.9
+    assert model.labels == known.labels
+    test = actions(4, 6)
+    forecast = model.forecast(test[1], [0.1, math.inf])
+    assert forecast.labels["swing"].shape == (len(test[1]),)
+    assert float(forecast.labels["swing"][len(test[1]) // 2]) > 0.8
+    total = torch.stack(list(forecast.labels.values())).sum(0)
+    assert torch.allclose(total, torch.ones_like(total), atol=1e-5)
+
+
+def test_a_label_with_one_demonstration_is_a_remark_and_half_of_them_an_error() -> None:
+    known = actions(13, 5)
+    lonely = known.labelled(["once", *known.labels[1:]])
+    assert "label 'once' has one demonstration" in str(learn(lonely, **QUICK).report)
+    with pytest.raises(ValueError, match="labels must be names, one for each"):
+        known.labelled([*known.labels[:5], *[None] * 8])
+    with pytest.raises(ValueError, match="'labels' has shape"):
+        known.labelled(known.labels[:5])
+
+
+def test_groups_that_nobody_named_are_found_and_grow() -> None:
+    """Two ways of handing over that lie far apart."""
+    made = interactions(24)
+    paths = [path + (torch.tensor([2.0, 2.0, 0.0, 0.0, 0.0]) if i % 2 else 0) for i, path in enumerate(made)]
+    known = Demonstrations(made.layout, paths, made.rate)
+    model = learn(known.subset(range(20)), **QUICK)
+    assert model.report["groups"] == {"group 1": 10, "group 2": 10}
+    assert model.labels == tuple(f"group {i % 2 + 1}" for i in range(20))
+    more = model.extend(known.subset([20, 21, 23]))
+    assert more.labels[20:] == ("group 1", "group 2", "group 2")
+    one = learn(made.subset(range(20)), **QUICK)
+    assert one.report["groups"] == {}
+    assert one.labels is None

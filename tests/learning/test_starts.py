@@ -34,11 +34,22 @@ def test_the_start_is_the_best_of_the_grid(tmp_path: Path) -> None:
     held_out = HeldOut(made, task, TuningSettings(folds=4, thinning=2))
     start = best_start(held_out, 100.0, 6, record=tmp_path / "scan.json")
     losses = json.loads((tmp_path / "scan.json").read_text())
-    assert len(losses) == 9
+    assert len(losses) == 17
     best = min(losses, key=lambda entry: entry["loss"])
-    assert start == Start(best["factor"], best["sharpness"])
+    assert start == Start(best["factor"], best["sharpness"], best["balance"], best["primacy"])
+    assert {entry["balance"] for entry in losses} == {0.5, 0.95, 0.05}  # the last one remembers everything
     filter = tunable(primitive, start)
-    assert filter.analysis.weighting.sharpness.value.item() == pytest.approx(start.sharpness)
+    shares = [start.balance * start.sharpness, (1 - start.balance) * start.sharpness]
+    assert filter.analysis.weighting.sharpness.value.tolist() == pytest.approx(shares)
     ratio = filter.model.measurement_noise.variance.value / primitive.residual_variance
     assert ratio.mean().item() == pytest.approx(start.factor, rel=1e-4)
     assert best_start(held_out, 100.0, 6, record=tmp_path / "scan.json") == start
+
+
+def test_one_memory_is_the_fast_one() -> None:
+    made, primitive = interactions(), small_primitive()
+    targets = made.layout.mask(["arm"])
+    task = Task(primitive, ForecastObjective(primitive, targets), targets, {"all": ~targets})
+    start = best_start(HeldOut(made, task, TuningSettings(folds=4, thinning=4)), 10.0, 4, memories=1)
+    assert start.balance is None
+    assert tunable(primitive, start).analysis.weighting.forgetting.value.tolist() == [6.0]

@@ -24,6 +24,7 @@ from torch_ebip.interaction.filters import (
 )
 from torch_ebip.interaction.forecast import Forecast
 from torch_ebip.interaction.gated_noise import PhaseGatedNoise
+from torch_ebip.interaction.horizons import HorizonShrinkage
 from torch_ebip.interaction.mixture import MixturePrior
 from torch_ebip.interaction.model import demonstration_states, interaction_model
 from torch_ebip.interaction.noise import InteractionNoise, PhaseNoise, WeightNoise
@@ -32,6 +33,7 @@ from torch_ebip.interaction.presets import bip, ebip, ebip_minus, particle_filte
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.interaction.priors import DemonstrationPrior, MomentPrior
 from torch_ebip.interaction.projection import BasisProjection
+from torch_ebip.interaction.recognition import Recognition
 from torch_ebip.interaction.shrinkage import Shrinkage
 from torch_ebip.interaction.table import DemonstrationTable
 from torch_ebip.interaction.trace import InteractionTrace
@@ -47,6 +49,7 @@ __all__ = [
     "EvidenceWeighting",
     "Forecast",
     "GaussianBasis",
+    "HorizonShrinkage",
     "InteractionEnsembleFilter",
     "InteractionExtendedFilter",
     "InteractionFilter",
@@ -59,6 +62,7 @@ __all__ = [
     "PhaseGatedNoise",
     "PhaseNoise",
     "PolynomialBasis",
+    "Recognition",
     "Shrinkage",
     "SigmoidBasis",
     "StackedBasis",

@@ -3,11 +3,15 @@
 The linear update shifts every demonstration by the same gain, which is right for a Gaussian prior. Real
 demonstrations come in clusters. Here each member keeps the demonstration it came from, and a tempered particle
 weight beside its Kalman shift: exp(-d^2 / 2h), d^2 the mean squared distance of that demonstration, near the
-member's phase, from the recent measurements. Missing sensors, uncertainty and gradients work as before.
+member's phase, from the measurements so far. Missing sensors, uncertainty and gradients work as before.
 
 Near, because the phase is known to a few hundredths only, and two demonstrations compared at the wrong phases
 seem to differ by their movement in between: the likelihood is averaged over a few phases about the member's.
 Where the demonstrations are comes from a `DemonstrationTable`.
+
+How far back it looks is a question of the interaction: a hand that hesitates is told by its last tenths of a second,
+an action whose end looks like another's by how it began. So there may be several memories that forget at rates of
+their own, a fast and a slow one; how much each counts is learned.
 """
 
 from __future__ import annotations
@@ -23,7 +27,7 @@ from torch_ebip.common.arguments import as_number
 from torch_ebip.common.brief import brief
 from torch_ebip.common.modules import Versions, sharing
 from torch_ebip.filtering.model import StateSpace
-from torch_ebip.filtering.noise.constraints import Positive
+from torch_ebip.filtering.noise.constraints import Positive, Signed
 from torch_ebip.filtering.protocols import View
 from torch_ebip.filtering.updates.weighting import Seen, Weighting
 from torch_ebip.interaction.table import KEPT, DemonstrationTable
@@ -35,8 +39,8 @@ class Evidence(NamedTuple):
 
     Attributes:
         weights: [..., E], of the members, summing to 1.
-        misfit: [..., E], discounted sum over samples of the distances.
-        seen: [...], discounted number of samples that measured something.
+        misfit: [..., M, E], of each memory: discounted sum over samples of the distances.
+        seen: [..., M], discounted number of samples that measured something.
     """
 
     weights: Tensor
@@ -52,14 +56,16 @@ class _Constants(NamedTuple):
 
     Attributes:
         scale: [k], of squared distances, divided by k.
-        sharpness: [], half of it.
-        slope: [].
+        sharpness: [M], half of it.
+        slope: [M].
+        primacy: [M].
         prior: [O], logarithms of the shares of the offsets.
     """
 
     scale: Tensor
     sharpness: Tensor
     slope: Tensor
+    primacy: Tensor
     prior: Tensor
 
     def __repr__(self) -> str:
@@ -67,10 +73,11 @@ class _Constants(NamedTuple):
 
 
 class EvidenceWeighting(Weighting):
-    """Weights (1 - defensive) softmax_j(-d_j^2 sharpness exp(slope (phase - 1/2)) / 2) + defensive / E.
+    """Weights (1 - defensive) softmax_j(-sum_m t_m d_jm^2 / 2) + defensive / E of M memories.
 
-    d_j^2 is the mean over recent samples, exponentially forgotten, of the distance D_j^2 of each, with t the
-    sharpness at that phase:
+    t_m = sharpness_m exp(slope_m (phase - 1/2)) is how much memory m counts. d_jm^2 is the mean over samples,
+    forgotten at its rate and weighed by exp(primacy_m (1/2 - phase)), of the distance D_j^2 of each, with t the sum
+    of the t_m:
 
         exp(-t D_j^2 / 2) = sum_o p_o exp(-t D_jo^2 / 2),  p_o ~ exp(-o^2 / (2 wander^2)),
 
@@ -81,15 +88,16 @@ class EvidenceWeighting(Weighting):
         table: of the demonstrations, numbered as in the prior.
         variance: [D], of each DoF over the demonstrations, squared units.
         modality_of_dof: int64 [D].
-        sharpness: 1/h at the start; learned. The larger, the fewer demonstrations speak.
-        forgetting: rate at the start, 1/s; learned.
-        slope: of the log sharpness over phase at the start; learned.
+        sharpness: 1/h at the start, of each memory or of all; learned. The larger, the fewer demonstrations speak.
+        forgetting: rate of each memory at the start, 1/s; learned. 0.01 remembers a whole interaction.
+        slope: of the log sharpness over phase at the start; learned, for each memory.
+        primacy: how much more each memory, or all, holds of what came first, at the start; learned. 0: all alike.
         defensive: share that is spread evenly over all members, so that no weight vanishes.
         wander: uncertainty of a member's phase at the start, a standard deviation; learned.
         offsets: [O], from a member's phase to where its demonstration is compared.
 
     Raises:
-        ValueError: a setting that is not positive, or a table of other DoFs.
+        ValueError: a setting that is not positive, or a table of other DoFs; as many sharpnesses as memories.
     """
 
     variance: Tensor
@@ -101,21 +109,28 @@ class EvidenceWeighting(Weighting):
         table: DemonstrationTable,
         variance: Tensor,
         modality_of_dof: Tensor,
-        sharpness: float = 10.0,
-        forgetting: float = 6.0,
+        sharpness: float | Sequence[float] = 10.0,
+        forgetting: float | Sequence[float] = 6.0,
         slope: float = 2.0,
+        primacy: float | Sequence[float] = 0.0,
         defensive: float = 0.02,
         wander: float = 0.08,
         offsets: Sequence[float] = (-0.1, -0.05, 0.0, 0.05, 0.1),
     ) -> None:
         super().__init__()
-        for name, value in {
-            "sharpness": sharpness,
-            "forgetting": forgetting,
-            "slope": slope,
-            "wander": wander,
-        }.items():
-            as_number(name, value, 0, above=True)
+        rates = [forgetting] if isinstance(forgetting, int | float) else list(forgetting)
+        sharp = [sharpness] * len(rates) if isinstance(sharpness, int | float) else list(sharpness)
+        first = [primacy] * len(rates) if isinstance(primacy, int | float) else list(primacy)
+        for name, values in {"sharpness": sharp, "primacy": first}.items():
+            if len(values) != len(rates) or not rates:
+                raise ValueError(
+                    f"{name} must be one number for each memory, got {len(values)} for {len(rates)} rates"
+                )
+        for value in first:
+            as_number("primacy", value)
+        for name, values in {"sharpness": sharp, "forgetting": rates, "slope": [slope], "wander": [wander]}.items():
+            for value in values:
+                as_number(name, value, 0, above=True)
         if not 0 < as_number("defensive", defensive) < 1:
             raise ValueError(f"defensive must lie between 0 and 1, got {defensive}")
         if table.n_dofs != len(variance) or len(modality_of_dof) != len(variance):
@@ -126,9 +141,10 @@ class EvidenceWeighting(Weighting):
         self.table = table
         self.register_buffer("variance", owned(variance))
         self.register_buffer("modality_of_dof", owned(modality_of_dof))
-        self.sharpness = Positive(variance.new_tensor(sharpness))
-        self.forgetting = Positive(variance.new_tensor(forgetting))
-        self.slope = Positive(variance.new_tensor(slope))
+        self.sharpness = Positive(variance.new_tensor(sharp))
+        self.forgetting = Positive(variance.new_tensor(rates))
+        self.slope = Positive(variance.new_tensor([slope] * len(rates)))
+        self.primacy = Signed(variance.new_tensor(first))
         self.factor = Positive(variance.new_ones(int(modality_of_dof.max()) + 1))
         self.wander = Positive(variance.new_tensor(wander))
         self.register_buffer("offsets", owned(variance.new_tensor(offsets)))
@@ -162,22 +178,20 @@ class EvidenceWeighting(Weighting):
         return part
 
     def named_values(self, layout: Layout) -> dict[str, float]:
-        """See `Part.named_values`: ``weighting/...``, and ``weighting/factor/MODALITY``."""
-        learned = {
-            "sharpness": self.sharpness,
-            "forgetting": self.forgetting,
-            "slope": self.slope,
-            "wander": self.wander,
-        }
-        values = {f"weighting/{name}": float(parameter.value) for name, parameter in learned.items()}
+        """See `Part.named_values`: ``weighting/...``, of several memories ``.../1`` and on; factors by modality."""
+        values = {"weighting/wander": float(self.wander.value)}
+        for name in ("sharpness", "forgetting", "slope", "primacy"):
+            each = getattr(self, name).value.tolist()
+            numbers = [f"/{i}" for i in range(1, len(each) + 1)] if len(each) > 1 else [""]
+            values |= {f"weighting/{name}{number}": value for number, value in zip(numbers, each, strict=True)}
         factors = zip(layout.names, self.factor.value.tolist(), strict=True)
         return values | {f"weighting/factor/{name}": factor for name, factor in factors}
 
     def start(self, origin: Tensor) -> Evidence:
         """Equal weights for members that have seen nothing, of the demonstrations int64 [..., E]."""
-        E = origin.shape[-1]
-        misfit = self.variance.new_zeros(origin.shape)
-        return Evidence(misfit + 1 / E, misfit, misfit.sum(-1))
+        E, M = origin.shape[-1], len(self.forgetting.start)
+        misfit = self.variance.new_zeros(*origin.shape[:-1], M, E)
+        return Evidence(misfit[..., 0, :] + 1 / E, misfit, misfit.sum(-1))
 
     def forget(self, memory: Evidence, dt: Tensor) -> Evidence:
         """Discount the past of a memory over dt [...] seconds."""
@@ -185,11 +199,11 @@ class EvidenceWeighting(Weighting):
         return Evidence(memory.weights, memory.misfit * keep.unsqueeze(-1), memory.seen * keep)
 
     def _discount(self, dt: Tensor) -> Tensor:
-        """What is left after dt [...] seconds; kept for the same tensor while the parameters stay as they are."""
+        """What is left after dt [...] seconds, [..., M]; kept for the same tensor while the parameters stay."""
         if not self._at_work:
-            return torch.exp(-self.forgetting.value * dt)
+            return torch.exp(-self.forgetting.value * dt.unsqueeze(-1))
         if self._forgetting_versions.changed() or self._discounted is None or self._discounted[0] is not dt:
-            self._discounted = dt, torch.exp(-self.forgetting.value * dt)
+            self._discounted = dt, torch.exp(-self.forgetting.value * dt.unsqueeze(-1))
         return self._discounted[1]
 
     def learn(self, memory: Evidence, seen: Seen) -> Evidence:
@@ -207,7 +221,7 @@ class EvidenceWeighting(Weighting):
             seen: what was measured.
         """
         y, observed, trust = seen.y, seen.observed, seen.trust
-        scale, sharpness, slope, prior = self._constants(seen.rows)
+        scale, sharpness, slope, primacy, prior = self._constants(seen.rows)
         K = y.shape[-1]
         if observed is None:
             difference, share, count = paths - (y if y.ndim == 1 else y[..., None, None, :]), trust, None
@@ -218,15 +232,19 @@ class EvidenceWeighting(Weighting):
         samples: Tensor | float = 1.0
         if share is not None:
             share = share / (K if count is None else count)
-            scale, samples = scale * share * K, share.sum(-1)
+            scale, samples = scale * share * K, share.sum(-1, keepdim=True)
         square = difference.square()
         distance = square @ scale if scale.ndim == 1 else (square @ scale[..., None, :, None]).squeeze(-1)
-        temper = (sharpness * torch.exp(slope * (seen.mean.select(-1, 0) - 0.5))).unsqueeze(-1)
+        late = seen.mean.narrow(-1, 0, 1) - 0.5
+        tempers = sharpness * torch.exp(slope * late)
+        held = torch.exp(-primacy * late)
+        temper = tempers.sum(-1, keepdim=True)
         likelihood = torch.logsumexp(torch.addcmul(prior, distance, temper.unsqueeze(-1), value=-1), -1)
-        misfit = evidence.misfit - likelihood / temper
-        total = evidence.seen + samples
+        misfit = evidence.misfit - held.unsqueeze(-1) * (likelihood / temper).unsqueeze(-2)
+        total = evidence.seen + held * samples
         # Less than one sample, where values are not trusted, counts as little as it is: it is not scaled up to one.
-        weights = torch.softmax(misfit * (temper / -total.clamp(min=1).unsqueeze(-1)), dim=-1)
+        shares = tempers / -total.clamp(min=1)
+        weights = torch.softmax((misfit * shares.unsqueeze(-1)).sum(-2), dim=-1)
         weights = (1 - self.defensive) * weights + self.defensive / weights.shape[-1]
         if observed is not None:
             weights = torch.where(observed.any(-1).unsqueeze(-1), weights, evidence.weights)
@@ -251,4 +269,6 @@ class EvidenceWeighting(Weighting):
         # A DoF that never moved in the demonstrations says nothing about which of them this is.
         scale = torch.where(variance > 0, self.factor.value[modality] / torch.where(variance > 0, variance, 1), 0)
         prior = torch.log_softmax(-0.5 * (self.offsets / self.wander.value).square(), -1)
-        return _Constants(scale / len(variance), 0.5 * self.sharpness.value, self.slope.value, prior)
+        return _Constants(
+            scale / len(variance), 0.5 * self.sharpness.value, self.slope.value, self.primacy.value, prior
+        )

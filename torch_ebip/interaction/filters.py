@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from torch_ebip.common.ambient import eager, outside_inference
-from torch_ebip.common.arguments import as_values
+from torch_ebip.common.ambient import eager
 from torch_ebip.common.draws import Generators
 from torch_ebip.filtering import functional
 from torch_ebip.filtering.base import EngineName, Filter
@@ -19,62 +17,35 @@ from torch_ebip.filtering.extended import ExtendedFilter, GaussianState
 from torch_ebip.filtering.members import MemberFilter
 from torch_ebip.filtering.particle import ParticleFilter
 from torch_ebip.filtering.protocols import MayLeaveSpan, View
-from torch_ebip.filtering.states import State
+from torch_ebip.filtering.states import Memory, State
 from torch_ebip.interaction.attribution import affine_coefficients
-from torch_ebip.interaction.forecast import Forecast
+from torch_ebip.interaction.forecast import Forecast, Phases, as_phases, as_seconds_ahead
 from torch_ebip.interaction.phases.phase import PhaseModel
 from torch_ebip.interaction.projection import BasisProjection
-from torch_ebip.interaction.shrinkage import Shrinkage
+from torch_ebip.interaction.readout import Readout, lead_of
+from torch_ebip.interaction.recognition import Recognition
 from torch_ebip.interaction.trace import InteractionTrace
-
-Phases: TypeAlias = Tensor | Sequence[float] | float
-"""Of a forecast."""
-
-
-def as_phases(phase: Phases, like: Tensor) -> Tensor:
-    """Phases [P] or [..., P] of a forecast, in the dtype and on the device of ``like``; one number is [1].
-
-    Raises:
-        ValueError: NaN or infinity, or no numbers at all.
-    """
-    if not isinstance(phase, Tensor):
-        phase = as_values("phase", phase, None, like)
-    phase = outside_inference(phase.to(like))
-    if not bool(phase.isfinite().all()):
-        raise ValueError("phases must be finite numbers, got NaN or infinity")
-    return phase.reshape(1) if phase.ndim == 0 else phase
-
-
-def as_seconds_ahead(ahead: Phases, like: Tensor) -> Tensor:
-    """Seconds [P] of a forecast, infinity allowed, in the dtype and on the device of ``like``; one number is [1].
-
-    Raises:
-        ValueError: NaN or negative numbers, more than one dimension.
-    """
-    seconds = ahead if isinstance(ahead, Tensor) else as_values("ahead", ahead, None, like)
-    seconds = outside_inference(seconds.to(like))
-    seconds = seconds.reshape(1) if seconds.ndim == 0 else seconds
-    if seconds.ndim != 1 or not bool((seconds >= 0).all()):
-        raise ValueError(f"ahead must be seconds [P], 0 or more, got {seconds.tolist()}")
-    return seconds
 
 
 class InteractionFilter(Filter):
     """A filter over an `interaction_model`: its states are what moves, the phase first, and the weights.
 
     Attributes:
-        readout: what its forecasts pass through, a `Shrinkage`; None: nothing.
+        readout: what its forecasts pass through, such as a `HorizonShrinkage`; None: nothing.
+        recognition: which labels its demonstrations have; None: none.
 
     Raises:
         ValueError: a model that is not one of an interaction, or a prior without demonstrations.
     """
 
     _trace = InteractionTrace
-    readout: Shrinkage | None
+    readout: Readout | None
+    recognition: Recognition | None
 
     def _check(self) -> None:
         """See `Filter._check`."""
         self.readout = None
+        self.recognition = None
         self._spread: tuple[Tensor, int, Tensor, list[Tensor]] | None = None
         model = self.model
         if not isinstance(model.dynamics, PhaseModel) or not isinstance(model.measurement, BasisProjection):
@@ -149,10 +120,9 @@ class InteractionFilter(Filter):
             forecast = self._forecast(state, self._phases_ahead(state, phase))
         if self.readout is None:
             return forecast
-        now = self.phase(state).clamp(0, 1).unsqueeze(-1)
-        lead = (forecast.phase - now).clamp(min=0)
-        result: Forecast = self.readout(forecast, lead, *self.demonstrated(forecast.phase.clamp(0, 1)))
-        return result
+        moving = self.moving(state)
+        lead = lead_of(moving[..., 0], self.phase_model.velocity(moving), forecast.phase)
+        return self.readout(forecast, lead, *self.demonstrated(lead.phase))
 
     @abstractmethod
     def _forecast(self, state: State, phase: Tensor) -> Forecast:
@@ -174,6 +144,29 @@ class InteractionFilter(Filter):
         _, _, mean, blocks = self._spread
         path, variance = basis.project_moments(phase, mean, blocks)
         return path, variance.clamp(min=0)
+
+    @eager
+    def recognise(self, state: State) -> dict[str, Tensor]:
+        """Which of the labelled interactions is going on: the probability [...] of each label, by name.
+
+        Args:
+            state: of this filter.
+
+        Raises:
+            ValueError: the demonstrations have no labels, or the filter does not weigh its members.
+        """
+        memory = getattr(state, "memory", None)
+        return self.recognised(Memory() if memory is None else memory, self.phase(state))
+
+    def recognised(self, memory: Memory, phase: Tensor) -> dict[str, Tensor]:
+        """See `recognise`, of the ``memory`` of an ensemble at a mean phase [...]; errors as there."""
+        if self.recognition is None:
+            raise ValueError(
+                "nothing to recognise: the demonstrations have no labels; give them, "
+                "`Demonstrations(..., labels=[...])`, or let `learn` look for groups"
+            )
+        probability = self.recognition(memory, phase)
+        return dict(zip(self.recognition.labels, probability.unbind(-1), strict=True))
 
     def attribution(self, state: State) -> Tensor:
         """Which demonstrations speak: the mean forecast is this affine combination of their trajectories.

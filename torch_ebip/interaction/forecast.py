@@ -2,13 +2,47 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
 
+from torch_ebip.common.ambient import outside_inference
+from torch_ebip.common.arguments import as_values
 from torch_ebip.common.brief import brief
 from torch_ebip.filtering.functional import scores
+
+Phases: TypeAlias = Tensor | Sequence[float] | float
+"""Of a forecast."""
+
+
+def as_phases(phase: Phases, like: Tensor) -> Tensor:
+    """Phases [P] or [..., P] of a forecast, in the dtype and on the device of ``like``; one number is [1].
+
+    Raises:
+        ValueError: NaN or infinity, or no numbers at all.
+    """
+    if not isinstance(phase, Tensor):
+        phase = as_values("phase", phase, None, like)
+    phase = outside_inference(phase.to(like))
+    if not bool(phase.isfinite().all()):
+        raise ValueError("phases must be finite numbers, got NaN or infinity")
+    return phase.reshape(1) if phase.ndim == 0 else phase
+
+
+def as_seconds_ahead(ahead: Phases, like: Tensor) -> Tensor:
+    """Seconds [P] of a forecast, infinity allowed, in the dtype and on the device of ``like``; one number is [1].
+
+    Raises:
+        ValueError: NaN or negative numbers, more than one dimension.
+    """
+    seconds = ahead if isinstance(ahead, Tensor) else as_values("ahead", ahead, None, like)
+    seconds = outside_inference(seconds.to(like))
+    seconds = seconds.reshape(1) if seconds.ndim == 0 else seconds
+    if seconds.ndim != 1 or not bool((seconds >= 0).all()):
+        raise ValueError(f"ahead must be seconds [P], 0 or more, got {seconds.tolist()}")
+    return seconds
 
 
 class Forecast(NamedTuple):
@@ -22,6 +56,8 @@ class Forecast(NamedTuple):
         weights: of the members, [..., P, E], summing to 1; None where all count alike.
         fair: whether the members are draws of equal standing, for whose finite number scores are corrected;
             not so for particles, which are a distribution of their own.
+        labels: probability [...] of each of the labelled interactions that may be going on, by name; None: nobody
+            asked.
     """
 
     mean: Tensor
@@ -30,6 +66,7 @@ class Forecast(NamedTuple):
     members: Tensor | None = None
     weights: Tensor | None = None
     fair: bool = True
+    labels: Mapping[str, Tensor] | None = None
 
     def __repr__(self) -> str:
         return brief(self)

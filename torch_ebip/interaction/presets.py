@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -25,6 +26,7 @@ from torch_ebip.interaction.model import demonstration_states, interaction_model
 from torch_ebip.interaction.phases.phase import PhaseModel
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.interaction.priors import DemonstrationPrior, MomentPrior
+from torch_ebip.interaction.recognition import Recognition
 from torch_ebip.interaction.table import DemonstrationTable
 
 MOST_GROWTH = 10.0
@@ -44,7 +46,9 @@ def ebip(
     inflation: float | nn.Module | None = None,
     square_root: bool = False,
     weigh: bool = False,
-    sharpness: float = 10.0,
+    sharpness: float | Sequence[float] = 10.0,
+    forgetting: float | Sequence[float] = 6.0,
+    primacy: float | Sequence[float] = 0.0,
     phase: PhaseModel | None = None,
 ) -> InteractionEnsembleFilter:
     """The paper's eBIP (Section IV): members are demonstrations, R is the closed form.
@@ -63,7 +67,9 @@ def ebip(
         inflation: of the anomalies, at most `MOST_GROWTH` in all; see `Inflation`.
         square_root: deterministic update.
         weigh: weigh members by the evidence for their demonstrations; see `EvidenceWeighting`.
-        sharpness: of that evidence at the start.
+        sharpness: of that evidence at the start, of each memory or of all.
+        forgetting: rates of its memories at the start, 1/s: several look back by several lengths of time.
+        primacy: how much more they hold of what came first, at the start.
         phase: how the phase moves; default: the paper's `ConstantVelocityPhase`.
 
     Returns:
@@ -77,7 +83,9 @@ def ebip(
     if weigh:
         modality_of_dof = primitive.layout.modality_of_dof.to(primitive.weights.device)
         table = DemonstrationTable.of(primitive)
-        weighting = EvidenceWeighting(table, primitive.value_variance, modality_of_dof, sharpness)
+        weighting = EvidenceWeighting(
+            table, primitive.value_variance, modality_of_dof, sharpness, forgetting, primacy=primacy
+        )
     update = Update(
         SquareRoot() if square_root else Stochastic(),
         _trust(robust, primitive),
@@ -86,7 +94,10 @@ def ebip(
         None if inflation is None else Inflation(inflation, MOST_GROWTH),
     )
     prior = DemonstrationPrior(demonstration_states(primitive, phase))
-    return InteractionEnsembleFilter(model, prior, len(primitive) if n_members is None else n_members, update)
+    filter = InteractionEnsembleFilter(model, prior, len(primitive) if n_members is None else n_members, update)
+    if primitive.labels is not None:
+        filter.recognition = Recognition(primitive.labels).to(primitive.weights)
+    return filter
 
 
 def ebip_minus(

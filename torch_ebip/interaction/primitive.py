@@ -40,6 +40,10 @@ class InteractionPrimitive(Meaning):
         value_variance: [D], variance of each DoF over all measured samples, squared units; 0 for a constant.
         longest_repeat: [M] seconds for which each modality says the same to the last digit; see `longest_repeats`.
         end_variance: [D], variance over demonstrations of h(1, w), squared units.
+        labels: which interaction each demonstration shows, N names; None where nothing says.
+
+    Raises:
+        ValueError: labels that are not one for each demonstration.
     """
 
     weights: Tensor
@@ -60,8 +64,12 @@ class InteractionPrimitive(Meaning):
         residual_correlation_time: Tensor,
         value_variance: Tensor,
         longest_repeat: Tensor | None = None,
+        labels: Sequence[str] | None = None,
     ) -> None:
         super().__init__()
+        if labels is not None and len(labels) != len(weights):
+            raise ValueError(f"{len(labels)} labels for {len(weights)} demonstrations")
+        self.labels = None if labels is None else tuple(labels)
         self.layout = layout
         self.basis = basis
         self.rate = rate
@@ -127,7 +135,10 @@ class InteractionPrimitive(Meaning):
         velocity = 1 / demonstrations.durations.to(weights)
         repeats = longest_repeats(demonstrations).to(weights.device)
         tensors: Sequence[Tensor] = (weights, velocity, variance, correlation, spread, repeats)
-        return cls(layout, basis, demonstrations.rate, *(tensor.to(dtype) for tensor in tensors))
+        made = [tensor.to(dtype) for tensor in tensors]
+        primitive = cls(layout, basis, demonstrations.rate, *made)  # type: ignore[arg-type]
+        primitive.labels = demonstrations.labels
+        return primitive
 
     def extra_repr(self) -> str:
         """Sizes, and what the columns are."""
@@ -161,6 +172,8 @@ class InteractionPrimitive(Meaning):
     def extend(self, demonstrations: Demonstrations) -> InteractionPrimitive:
         """The same basis and noise with more demonstrations: at least one, which need no more than a regression.
 
+        Labels are kept where both have them.
+
         Args:
             demonstrations: in the dtype and on the device of this primitive.
 
@@ -180,6 +193,7 @@ class InteractionPrimitive(Meaning):
             self.residual_correlation_time,
             self.value_variance,
             torch.maximum(self.longest_repeat, more.longest_repeat),
+            None if self.labels is None or demonstrations.labels is None else (*self.labels, *demonstrations.labels),
         )
 
     def subset(self, indices: Sequence[int] | Sequence[bool] | Tensor) -> InteractionPrimitive:
@@ -202,4 +216,5 @@ class InteractionPrimitive(Meaning):
             self.residual_correlation_time,
             self.value_variance,
             self.longest_repeat,
+            None if self.labels is None else [self.labels[i] for i in indices.tolist()],
         )

@@ -17,6 +17,7 @@ from torch_ebip.common.ambient import owned
 from torch_ebip.common.arguments import as_values
 from torch_ebip.filtering.protocols import View
 from torch_ebip.interaction.forecast import Forecast
+from torch_ebip.interaction.readout import Lead
 
 LEADS = (0.0, 0.125, 0.25, 0.5, 1.0)
 """How far ahead a share is learned for, in phase: nothing, and from an eighth of the interaction to all of it."""
@@ -24,6 +25,8 @@ LEADS = (0.0, 0.125, 0.25, 0.5, 1.0)
 
 class Shrinkage(nn.Module):
     """Mean m + s (f - m), standard deviation (1 - s) sigma_m + s sigma_f; s by DoF and by how far ahead it is.
+
+    What `learn` made before `HorizonShrinkage`; older model files have it.
 
     Members keep their order and their weights: they are moved with the mean and stretched with the deviation.
 
@@ -37,9 +40,11 @@ class Shrinkage(nn.Module):
     Example:
         >>> import torch
         >>> from torch_ebip.interaction import Forecast, Shrinkage
+        >>> from torch_ebip.interaction.readout import Lead
         >>> half = Shrinkage(torch.full((1, 5), 0.5))
         >>> forecast = Forecast(torch.tensor([[2.0]]), torch.tensor([[1.0]]), torch.ones(1))
-        >>> half(forecast, torch.tensor([0.3]), torch.tensor([[0.0]]), torch.tensor([[9.0]])).mean.tolist()
+        >>> lead = Lead(torch.tensor([0.3]), torch.tensor([0.5]), torch.tensor([1.0]))
+        >>> half(forecast, lead, torch.tensor([[0.0]]), torch.tensor([[9.0]])).mean.tolist()
         [[1.0]]
     """
 
@@ -65,16 +70,16 @@ class Shrinkage(nn.Module):
         part = ((lead - start) / (leads[right] - start)).clamp(0, 1).unsqueeze(-1)
         return torch.lerp(share[left], share[right], part)
 
-    def forward(self, forecast: Forecast, lead: Tensor, mean: Tensor, variance: Tensor) -> Forecast:
+    def forward(self, forecast: Forecast, lead: Lead, mean: Tensor, variance: Tensor) -> Forecast:
         """Draw a forecast towards the demonstrations.
 
         Args:
             forecast: of the filter, mean [..., P, D].
-            lead: [..., P], how far ahead it is, in phase.
+            lead: of it, how far ahead it is.
             mean: [..., P, D], of the demonstrations at the phases of the forecast, units of the DoFs.
             variance: [..., P, D], of the demonstrations there, squared units.
         """
-        share = self.at(lead)
+        share = self.at(lead.ahead)
         drawn = mean + share * (forecast.mean - mean)
         own = forecast.variance.clamp(min=torch.finfo(mean.dtype).tiny).sqrt()
         deviation = (1 - share) * variance.clamp(min=0).sqrt() + share * own
@@ -101,12 +106,3 @@ class Shrinkage(nn.Module):
     def meant(self) -> str:
         """What its tensors mean, see `Meaning`: nothing beside themselves."""
         return ""
-
-
-def hats(lead: Tensor, leads: Tensor) -> Tensor:
-    """Weights [..., K] of linear interpolation between leads [K], increasing, at a lead [...] within them."""
-    right = torch.searchsorted(leads, lead.contiguous(), right=True).clamp(1, len(leads) - 1)
-    left = right - 1
-    part = ((lead - leads[left]) / (leads[right] - leads[left])).unsqueeze(-1)
-    one = torch.nn.functional.one_hot
-    return one(left, len(leads)) * (1 - part) + one(right, len(leads)) * part

@@ -1,7 +1,8 @@
 """Learning: losses, what tuning minimises, the tuner, and what is kept and shown of it."""
 
 from torch_ebip.learning.checkpoint import load_checkpoint, save_checkpoint
-from torch_ebip.learning.interaction_model import InteractionModel, load_model
+from torch_ebip.learning.interaction_model import InteractionModel
+from torch_ebip.learning.loading import load_model
 from torch_ebip.learning.losses import (
     CRPSLoss,
     EnergyScoreLoss,

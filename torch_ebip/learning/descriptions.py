@@ -25,14 +25,18 @@ from torch_ebip.interaction.basis.gaussian import GaussianBasis
 from torch_ebip.interaction.basis.polynomial import PolynomialBasis
 from torch_ebip.interaction.basis.sigmoid import SigmoidBasis
 from torch_ebip.interaction.basis.stacked import StackedBasis
+from torch_ebip.interaction.evidence import EvidenceWeighting
 from torch_ebip.interaction.filters import InteractionEnsembleFilter, InteractionFilter
 from torch_ebip.interaction.gated_noise import PhaseGatedNoise
+from torch_ebip.interaction.horizons import HorizonShrinkage
 from torch_ebip.interaction.noise import InteractionNoise
 from torch_ebip.interaction.phases.constant_velocity import ConstantVelocityPhase
 from torch_ebip.interaction.phases.drifting import DriftingPhase
 from torch_ebip.interaction.phases.phase import PhaseModel
 from torch_ebip.interaction.presets import ebip
 from torch_ebip.interaction.primitive import InteractionPrimitive
+from torch_ebip.interaction.readout import Readout
+from torch_ebip.interaction.recognition import PHASES, Recognition
 from torch_ebip.interaction.shrinkage import Shrinkage
 from torch_ebip.recordings.layout import Layout, Modality
 
@@ -40,7 +44,19 @@ BASES: dict[str, type[Basis]] = {
     family.__name__: family for family in (BSplineBasis, GaussianBasis, PolynomialBasis, SigmoidBasis)
 }
 TRUST: dict[str, Callable[[], RobustWeights]] = {"Cauchy": Cauchy, "Gate": Gate, "Huber": Huber, "StudentT": StudentT}
-OPTIONS = ("n_members", "square_root", "weigh", "localise", "weight_noise", "context", "robust", "inflation", "phase")
+OPTIONS = (
+    "n_members",
+    "square_root",
+    "weigh",
+    "forgetting",
+    "primacy",
+    "localise",
+    "weight_noise",
+    "context",
+    "robust",
+    "inflation",
+    "phase",
+)
 """Of `ebip`."""
 
 Description = dict[str, Any]
@@ -100,12 +116,14 @@ def describe_filter(filter: InteractionFilter, primitive: InteractionPrimitive) 
     if type(filter) is not InteractionEnsembleFilter:
         raise TypeError(f"a model file keeps filters that `ebip` makes, not {type(filter).__name__}")
     update, noise = filter.analysis, filter.model.measurement_noise
-    inflation = update.inflation
+    inflation, weighting = update.inflation, update.weighting
     learned = isinstance(inflation, Inflation) and isinstance(inflation.factor, nn.Module)
     description: Description = {
         "n_members": filter.n_members,
         "square_root": isinstance(update.rule, SquareRoot),
         "weigh": update.weighting is not None,
+        "forgetting": weighting.forgetting.start.tolist() if isinstance(weighting, EvidenceWeighting) else 6.0,
+        "primacy": weighting.primacy.start.tolist() if isinstance(weighting, EvidenceWeighting) else 0.0,
         "localise": update.localisation is not None,
         "weight_noise": isinstance(filter.model.process_noise, InteractionNoise)
         and filter.model.process_noise.weights is not None,
@@ -113,7 +131,8 @@ def describe_filter(filter: InteractionFilter, primitive: InteractionPrimitive) 
         "robust": type(update.trust[0]).__name__ if len(update.trust) else None,
         "inflation": "learned" if learned else float(inflation.factor) if isinstance(inflation, Inflation) else None,  # type: ignore[arg-type]
         "phase": _describe_phase(filter.phase_model),
-        "readout": list(filter.readout.leads.tolist()) if isinstance(filter.readout, Shrinkage) else None,
+        "readout": _describe_readout(filter.readout),
+        "recognition": 0 if filter.recognition is None else len(filter.recognition.sharpness),
     }
     again = build_filter(primitive, description)
     ours, theirs = ({name: type(m).__name__ for name, m in each.named_modules()} for each in (filter, again))
@@ -133,7 +152,9 @@ def build_filter(primitive: InteractionPrimitive, description: Description) -> I
         ValueError: a description of no filter.
     """
     try:
-        options = {name: description[name] for name in OPTIONS}
+        options = {
+            name: description[name] for name in OPTIONS if name in description
+        }  # older files say nothing of memories
         readout = description["readout"]
         if options["context"] is not None:
             options["context"] = basis_of(options["context"])
@@ -144,9 +165,11 @@ def build_filter(primitive: InteractionPrimitive, description: Description) -> I
         options["weight_noise"] = 1.0 if options["weight_noise"] else None
         options["phase"] = _phase_of(options["phase"])
         filter = ebip(primitive, **options)
-        if readout is not None:
-            share = primitive.weights.new_ones(primitive.layout.n_dofs, len(readout))
-            filter.readout = Shrinkage(share, readout)
+        memories = description.get("recognition", 0)
+        if memories and primitive.labels is not None:
+            ones = primitive.weights.new_ones(memories, len(PHASES))
+            filter.recognition = Recognition(primitive.labels, ones).to(primitive.weights)
+        filter.readout = None if readout is None else _readout_of(readout, primitive)
         return filter
     except (AttributeError, ArithmeticError, LookupError, TypeError, ValueError) as error:
         raise ValueError(f"a description of no filter that `ebip` makes: {error}") from error
@@ -176,6 +199,8 @@ def fill(filter: nn.Module, tensors: Mapping[str, Tensor]) -> None:
     """
     places = tensors_of(filter)
     for name, tensor in tensors.items():
+        if name in places and places[name].shape == (1,) and tensor.shape == ():  # a memory in older files
+            tensor = tensor.unsqueeze(0)
         if name not in places or places[name].shape != tensor.shape:
             expected = list(places[name].shape) if name in places else "none of that name"
             raise ValueError(f"a tensor {name} {list(tensor.shape)}, expected {expected}")
@@ -187,6 +212,25 @@ def _describe_phase(phase: PhaseModel) -> Description:
     if family not in (ConstantVelocityPhase, DriftingPhase):
         raise TypeError(f"a model file keeps the phases of the library, not {family.__name__}")
     return {"family": family.__name__, "overrun": phase.overrun}
+
+
+def _describe_readout(readout: Readout | None) -> Any:
+    if readout is None:
+        return None
+    if isinstance(readout, HorizonShrinkage):
+        return {"seconds": readout.seconds.tolist(), "levels": readout.levels.tolist()}
+    if isinstance(readout, Shrinkage):
+        return readout.leads.tolist()
+    raise TypeError(f"a model file keeps the read-outs of the library, not {type(readout).__name__}")
+
+
+def _readout_of(description: Any, primitive: InteractionPrimitive) -> Readout:
+    ones = primitive.weights.new_ones
+    D = primitive.layout.n_dofs
+    if isinstance(description, list):  # of older files
+        return Shrinkage(ones(D, len(description)), description)
+    seconds, levels = description["seconds"], description["levels"]
+    return HorizonShrinkage(ones(D, len(seconds), len(levels)), ones(D, len(seconds)), seconds, levels)
 
 
 def _phase_of(description: Description) -> PhaseModel:

@@ -23,6 +23,7 @@ from torch_ebip.learning.configuration import Task
 from torch_ebip.learning.objective import ForecastObjective
 from torch_ebip.learning.partition import Partition, generator_of
 from torch_ebip.learning.ranks import Ranks
+from torch_ebip.learning.references import last_measured, recorded
 from torch_ebip.learning.settings import TuningSettings
 from torch_ebip.recordings.demonstrations import Demonstrations
 
@@ -41,7 +42,8 @@ class Shown(NamedTuple):
         observed: bool [B, T, D'], what of it is shown.
         steps: int64 [B, K], at which samples the horizons are.
         now: [B, K], true phases of the horizons.
-        truth: [B, K, P, D_targets], regressions at the objective's phases ahead of them.
+        truth: [B, K, P, D_targets], what the objective asks for: regressions at its phases, or what was recorded
+            so many seconds later, NaN where nothing was.
         targets: bool [D'], those among the D'.
     """
 
@@ -83,9 +85,10 @@ class Trial(NamedTuple):
         )
         return terms
 
-    def forecast(self, phase: Tensor) -> Forecast:
-        """Of the targets at phases [B, K, P], from the states at the horizons."""
-        return self.filter.forecast(self.trace.kept, phase).select(self.shown.targets)
+    def forecast(self, objective: ForecastObjective) -> Forecast:
+        """Of the targets where an objective asks for them, from the kept states: mean [B, K, P, D_targets]."""
+        said = objective.forecast(self.filter, self.trace.kept, self.shown.now)
+        return said.select(self.shown.targets)
 
 
 class HeldOut:
@@ -106,6 +109,7 @@ class HeldOut:
         device = task.primitive.weights.device
         self.values, self.observed = (tensor.to(device) for tensor in demonstrations.pad())
         self.lengths = demonstrations.lengths.to(device)
+        self.ends = torch.stack([last_measured(trajectory) for trajectory in demonstrations]).to(device)
         self.partition = Partition(len(demonstrations), settings)
 
     @property
@@ -137,7 +141,11 @@ class HeldOut:
         within = torch.arange(length, device=steps.device).view(1, -1, 1) <= steps.amax(-1).view(-1, 1, 1)
         observed = observed & within
         now = (steps * stride / last).to(y)
-        truth = self.truth(interactions, task.objective.phases_ahead(now))
+        ahead = task.objective.ahead
+        if ahead is None:
+            truth = self.truth(interactions, task.objective.phases_ahead(now))
+        else:
+            truth = self.recorded(interactions, steps * stride, ahead)
         targets = task.targets[kept_dofs]
         return Shown(interactions, members, kept_dofs, y, observed, steps, now, truth, targets)
 
@@ -169,6 +177,19 @@ class HeldOut:
         primitive = self.task.primitive
         weights = primitive.weights[interactions, None, None, :]
         return primitive.basis.project(phase, weights)[..., self.task.targets]
+
+    def recorded(self, interactions: Tensor, now: Tensor, ahead: Tensor) -> Tensor:
+        """[B, K, P, D_targets], of interactions int64 [B]: what was measured ``ahead`` [P] seconds after samples
+        now, see `references.recorded`.
+
+        Args:
+            interactions: int64 [B].
+            now: int64 [B, K].
+            ahead: [P], s.
+        """
+        targets, rate = self.task.targets, self.task.primitive.rate
+        values, ends = self.values[interactions][..., targets], self.ends[interactions][..., targets]
+        return recorded(values, self.lengths[interactions], ends, now, ahead, rate)
 
     def portions(self, interactions: Tensor, subset: Tensor, shares: Tensor | None = None) -> Iterator[Shown]:
         """This process's part of some interactions, always at the same horizons, a few at a time.

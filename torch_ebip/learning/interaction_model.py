@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -28,6 +27,7 @@ from torch_ebip.learning.descriptions import (
     stack_of,
     tensors_of,
 )
+from torch_ebip.learning.groups import groups_of
 from torch_ebip.learning.model_file import read_model_file, write_model_file
 from torch_ebip.learning.recorded import forecast_recorded
 from torch_ebip.learning.report import Report
@@ -50,11 +50,11 @@ class InteractionModel:
         primitive: of the demonstrations that are its members.
         report: how it came about and what it is worth, see `Report`.
         targets: names of the modalities that it forecasts; default: those that are controlled.
-        labels: which interaction each of the N demonstrations shows; None where nothing says.
+        labels: which interaction each of the N demonstrations shows; default: those of the primitive.
 
     Raises:
         ValueError: a filter of other columns than the primitive, or whose members are other demonstrations; labels
-            that are not one a demonstration.
+            that are not those of the primitive.
 
     Example:
         >>> import torch
@@ -92,8 +92,12 @@ class InteractionModel:
         for name in named:
             layout.slice(name)
         object.__setattr__(self, "targets", named)
-        if self.labels is not None and len(self.labels) != len(self.primitive):
-            raise ValueError(f"{len(self.labels)} labels for {len(self.primitive)} demonstrations")
+        labels = self.primitive.labels if self.labels is None else tuple(self.labels)
+        if labels is not None and len(labels) != len(self.primitive):
+            raise ValueError(f"{len(labels)} labels for {len(self.primitive)} demonstrations")
+        if labels != self.primitive.labels:
+            raise ValueError("the labels are not those of the primitive: `InteractionPrimitive.fit` takes them over")
+        object.__setattr__(self, "labels", labels)
 
     @property
     def layout(self) -> Layout:
@@ -164,17 +168,13 @@ class InteractionModel:
                 owner, _, rest = name.partition(".")
                 parts[owner][rest] = tensor
             layout, basis = layout_of(description["layout"]), stack_of(description["basis"])
-            primitive = InteractionPrimitive(layout, basis, float(description["rate"]), **parts["primitive"])
+            labels = description["labels"]
+            primitive = InteractionPrimitive(
+                layout, basis, float(description["rate"]), **parts["primitive"], labels=labels
+            )
             filter = build_filter(primitive, description["filter"])
             fill(filter, parts["filter"])
-            labels = description["labels"]
-            return cls(
-                filter,
-                primitive,
-                Report(description["report"]),
-                tuple(description["targets"]),
-                None if labels is None else tuple(labels),
-            )
+            return cls(filter, primitive, Report(description["report"]), tuple(description["targets"]))
         except (AttributeError, ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:
             raise ValueError(f"{path}: a model whose parts do not fit together: {error}") from error
 
@@ -207,6 +207,7 @@ class InteractionModel:
 
         Returns:
             Mean, variance [T, A, D] from what was measured up to each sample, and phase [T, A]; without members.
+            Where there are labels, the probability [T] of each.
 
         Raises:
             ValueError: other columns; no time ahead, NaN or a negative one; infinite values.
@@ -233,6 +234,10 @@ class InteractionModel:
         """
         mine = self.primitive
         new = self.prepare(demonstrations).to(dtype=mine.weights.dtype, device=mine.weights.device)
+        if self.labels is not None and new.labels is None and self.report.get("groups"):
+            # Nobody named the groups of the first ones either.
+            other = InteractionPrimitive.fit(new if len(new) > 1 else new.subset([0, 0]), mine.basis)
+            new = new.labelled(groups_of(mine, self.labels, other)[: len(new)])
         if (new.labels is None) != (self.labels is None):
             raise ValueError("labels: the model and the recordings must both have them, or neither")
         primitive = mine.extend(new)
@@ -240,10 +245,9 @@ class InteractionModel:
         if description["n_members"] == len(mine):
             description["n_members"] = len(primitive)
         report = Report({**self.report.plain(), "extended_by": self.report.get("extended_by", 0) + len(new)})
-        labels = None if self.labels is None or new.labels is None else (*self.labels, *new.labels)
         filter = build_filter(primitive, description)
         fill(filter, own_tensors(self.filter, build_filter(mine, description)))
-        return replace(self, filter=filter, primitive=primitive, report=report, labels=labels)
+        return replace(self, filter=filter, primitive=primitive, report=report, labels=primitive.labels)
 
     def rebuilt(self, n_members: int | None = None, robust: RobustWeights | None = None) -> InteractionModel:
         """The same model with an ensemble of another size, or that weighs surprising values less.
@@ -266,34 +270,3 @@ class InteractionModel:
         filter = build_filter(self.primitive, description).to(self.primitive.weights)
         fill(filter, own)
         return replace(self, filter=filter)
-
-
-def load_model(path: str | os.PathLike[str]) -> InteractionModel:
-    """A model, of its file or of the run folder of an experiment.
-
-    Args:
-        path: of either.
-
-    Raises:
-        FileNotFoundError: there is no such file or folder, or no model in it.
-        ValueError: see `InteractionModel.load`.
-
-    Example:
-        >>> import tempfile
-        >>> from torch_ebip import InteractionModel, InteractionPrimitive, ebip, load_model
-        >>> from torch_ebip.recordings import example
-        >>> primitive = InteractionPrimitive.fit(example())
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     InteractionModel(ebip(primitive), primitive).save(folder + "/model.safetensors")
-        ...     model = load_model(folder)
-        >>> model.sensors
-        ('hand', 'gaze')
-    """
-    place = Path(path)
-    if place.is_dir():
-        place = place / NAME
-        if not place.exists():
-            inside = sorted(part.parent.name for part in place.parent.glob(f"*/{NAME}"))
-            hint = f"; there is one in {', '.join(inside[:10])}" if inside else ""
-            raise FileNotFoundError(f"{place.parent}: no {NAME} in this folder{hint}")
-    return InteractionModel.load(place)

@@ -11,11 +11,14 @@ from torch import Tensor
 from torch_ebip.common.ambient import owned, without_autocast
 from torch_ebip.common.arguments import as_mask, as_number, as_values
 from torch_ebip.common.meaning import Meaning
+from torch_ebip.filtering.states import State
 from torch_ebip.filtering.trace import Trace
 from torch_ebip.interaction.filters import InteractionFilter
+from torch_ebip.interaction.forecast import Forecast
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.kinematics import RobotArm
-from torch_ebip.learning.losses import ForwardKinematicsLoss, InnovationLikelihoodLoss, TrajectoryLoss
+from torch_ebip.learning.horizons import LEAST, LEAST_END, as_ahead, goes_on, horizon_name, spread_ahead
+from torch_ebip.learning.losses import ForwardKinematicsLoss, InnovationLikelihoodLoss
 from torch_ebip.recordings.layout import Layout
 
 
@@ -39,25 +42,32 @@ class Weights(NamedTuple):
 class ForecastObjective(Meaning):
     """Scores the forecasts that a filter makes of some DoFs, from states kept at several horizons.
 
-    The target is an interaction's own regression, so it exists at every phase. Each DoF counts in units of its
-    standard deviation at phase 1 over the demonstrations.
+    Either at phases between now and the end, against an interaction's own regression, which exists at every phase;
+    or so many seconds ahead, against what was recorded then, every horizon counting alike. Each DoF counts in units
+    of its standard deviation over the demonstrations: at phase 1; for seconds, at the times since they began that the
+    horizon asks for, and at the end at least a tenth of that, since interactions may all end alike.
 
     Args:
         primitive: of the demonstrations that are tuned on.
         targets: bool [D], the DoFs to forecast.
-        phases: [P], where between now (0) and the end (1) the forecast is scored.
+        phases: [P], where between now (0) and the end (1) the forecast is scored; default: half-way and the end.
         weights: of the terms.
         arm: for the term ``tool``: a loss on its joints.
         arm_dofs: bool [D], the joints of the arm, all of them targets. Where they have the names of the arm's joints
             they are taken by name, in whatever order the columns are; otherwise in order.
+        ahead: [P] instead of phases, seconds from now at which it is scored, increasing; infinity, which comes last,
+            is the end.
 
     Raises:
         ValueError: no target, a target that never varies, a negative weight, or a tool term without an arm; joints
-            that are no targets, are not as many as the arm's, have some of their names only, or another unit.
+            that are no targets, are not as many as the arm's, have some of their names only, or another unit; phases
+            and seconds; seconds that are not increasing, or longer than nearly all demonstrations go on.
     """
 
     phases: Tensor
+    ahead: Tensor | None
     scale: Tensor
+    shares: Tensor | None
 
     def __init__(
         self,
@@ -67,8 +77,11 @@ class ForecastObjective(Meaning):
         weights: Weights | None = None,
         arm: ForwardKinematicsLoss | None = None,
         arm_dofs: Tensor | None = None,
+        ahead: Sequence[float] | Tensor | None = None,
     ) -> None:
         super().__init__()
+        if ahead is not None and phases is not None:
+            raise ValueError("forecasts are scored at phases or at seconds ahead, got both")
         self.weights = Weights() if weights is None else weights
         for term, weight in self.weights._asdict().items():
             as_number(f"the weight of {term}", weight, 0)
@@ -76,31 +89,49 @@ class ForecastObjective(Meaning):
         if self.weights.tool and (arm is None or arm_dofs is None):
             raise ValueError("the tool term needs an arm and the DoFs that are its joints")
         ends = primitive.end_variance
-        fixed = targets & ~(ends > 1e-8 * primitive.residual_variance)
+        seconds = None if ahead is None else as_ahead(ahead, ends)
+        spreads = ends.unsqueeze(0) if seconds is None else spread_ahead(primitive, seconds)
+        often = spreads.amax(0)
+        fixed = targets & ~((often > 1e-8 * primitive.residual_variance) & (primitive.value_variance > 0))
         if not bool(targets.any()) or bool(fixed.any()):
             names = [dof for dof, still in zip(primitive.layout.dofs, fixed.tolist(), strict=True) if still]
-            raise ValueError(f"targets must be DoFs that end differently in different demonstrations, got {names}")
+            how = "end differently" if ahead is None else "differ"
+            raise ValueError(f"targets must be DoFs that {how} in different demonstrations, got {names}")
         scale = ends.sqrt()[targets]
+        shares = None
+        if seconds is not None:
+            shares = goes_on(primitive, seconds)
+            if bool((shares < LEAST).any()):
+                early = ", ".join(f"{float(a):g} s" for a in seconds[shares < LEAST])
+                raise ValueError(f"{early} ahead lies behind the end of nearly all demonstrations: leave it out")
+            scale = torch.maximum(spreads, LEAST_END**2 * often)[:, targets].sqrt()
+        self.register_buffer("ahead", None if seconds is None else owned(seconds))
+        self.register_buffer("shares", None if shares is None else owned(shares))
         self.register_buffer("scale", owned(scale))
-        self.squared_error = TrajectoryLoss(scale)
         self.innovation = InnovationLikelihoodLoss()
         self.arm = arm
         self.names = [dof for dof, ours in zip(primitive.layout.dofs, targets.tolist(), strict=True) if ours]
         self.joints = None
         if arm is not None and arm_dofs is not None:
             self.joints = _joints(arm.arm, primitive.layout, as_mask("arm_dofs", arm_dofs, len(targets)), self.names)
-        phases = scale.new_tensor([0.5, 1.0]) if phases is None else as_values("phases", phases, None, scale)
+        phases = scale.new_tensor([0.5, 1.0]) if phases is None else as_values("phases", phases, None, ends)
         if phases.ndim != 1 or not bool(((phases >= 0) & (phases <= 1)).all()):
             raise ValueError(f"phases must be [P], from 0 (now) to 1 (the end), got {phases}")
         self.register_buffer("phases", owned(phases))
 
     def extra_repr(self) -> str:
         """What is scored, and how much each term counts."""
-        return f"targets={', '.join(self.names)}, {self.weights}"
+        ahead = "" if self.ahead is None else f", ahead={self.ahead.tolist()}"
+        return f"targets={', '.join(self.names)}, {self.weights}{ahead}"
 
     def meant(self) -> str:
         """What its tensors mean, see `Meaning`."""
         return f"targets={', '.join(self.names)}"
+
+    @property
+    def horizons(self) -> tuple[str, ...] | None:
+        """Names of the P horizons, such as ``0.25 s`` and ``end``; None for phases."""
+        return None if self.ahead is None else tuple(horizon_name(a) for a in self.ahead.tolist())
 
     @without_autocast
     def forward(
@@ -112,7 +143,7 @@ class ForecastObjective(Meaning):
             filter: that made the trace.
             trace: with states kept at K horizons, batch [B].
             observed: bool [B, T, D'], what the filter was shown (D' DoFs of the filter).
-            truth: [B, K, P, D_targets], at `phases_ahead`.
+            truth: [B, K, P, D_targets], at `phases_ahead`, or ``ahead`` seconds later; NaN: not measured.
             now: [B, K], true phases of the horizons.
             targets: bool [D'], the targets among the filter's DoFs.
 
@@ -121,18 +152,43 @@ class ForecastObjective(Meaning):
         """
         if trace.kept is None:
             raise ValueError("the trace kept no states to forecast from")
-        forecast = filter.forecast(trace.kept, self.phases_ahead(now)).select(targets)
+        forecast = self.forecast(filter, trace.kept, now).select(targets)
+        measured = ~truth.isnan()
+        # Before the arithmetic: a NaN that is multiplied by 0 afterwards is NaN, and so is its gradient.
+        wanted = torch.where(measured, truth, forecast.mean.detach())
         terms = {}
         if self.weights.crps:
-            terms["crps"] = self.weights.crps * (forecast.crps(truth) / self.scale).mean()
+            terms["crps"] = self.weights.crps * self.mean(forecast.crps(wanted) / self.scale, measured)
         if self.weights.squared_error:
-            terms["squared_error"] = self.weights.squared_error * self.squared_error(forecast.mean, truth)
+            squares = ((forecast.mean - wanted) / self.scale).square()
+            terms["squared_error"] = self.weights.squared_error * self.mean(squares, measured)
         if self.weights.tool and self.arm is not None and self.joints is not None:
             joints, wanted = forecast.mean[..., -1, self.joints], truth[..., -1, self.joints]
             terms["tool"] = self.weights.tool * self.arm(joints, wanted)
         if self.weights.innovation:
             terms["innovation"] = self.weights.innovation * self.innovation(trace.log_likelihood, observed)
         return terms
+
+    def forecast(self, filter: InteractionFilter, state: State, now: Tensor) -> Forecast:
+        """What a filter says at the horizons that are scored.
+
+        Args:
+            filter: of the state.
+            state: batch [B, K].
+            now: [B, K], true phases.
+        """
+        if self.ahead is None:
+            return filter.forecast(state, self.phases_ahead(now))
+        return filter.forecast(state, ahead=self.ahead)
+
+    def mean(self, values: Tensor, measured: Tensor) -> Tensor:
+        """Scalar, of values [B, K, P, D_targets] where measured; of seconds, every horizon counts alike.
+
+        What is divided by does not depend on the batch, so that parts of it have a mean.
+        """
+        if self.ahead is None or self.shares is None:
+            return torch.where(measured, values, 0).mean()
+        return (torch.where(measured, values, 0).mean((0, 1, 3)) / self.shares).mean()
 
     def phases_ahead(self, now: Tensor) -> Tensor:
         """Phases [..., P] that are scored from the phases now [...] of the horizons."""
@@ -147,7 +203,7 @@ class ForecastObjective(Meaning):
         Args:
             filter: that made the trace.
             trace: with states kept at K horizons, batch [B].
-            truth: [B, K, P, D_targets], the last of the P phases being 1.
+            truth: [B, K, P, D_targets], the last of the P horizons being the end.
             targets: bool [D'], the targets among the filter's DoFs.
 
         Raises:
@@ -157,8 +213,10 @@ class ForecastObjective(Meaning):
             raise ValueError("the trace kept no states to forecast from")
         end = torch.ones(1, dtype=truth.dtype, device=truth.device)
         forecast = filter.forecast(trace.kept, end).select(targets)
-        error = (forecast.mean[..., 0, :] - truth[..., -1, :]) / self.scale
-        variance = forecast.variance / self.scale.square()
+        scale = self.scale if self.ahead is None else self.scale[-1]
+        error = (forecast.mean[..., 0, :] - truth[..., -1, :]) / scale
+        error = torch.where(error.isnan(), 0, error)
+        variance = forecast.variance / scale.square()
         return torch.stack([variance.mean().sqrt(), error.square().mean().sqrt()])
 
 

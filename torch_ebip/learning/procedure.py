@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import platform
 import time
 from collections.abc import Mapping
@@ -14,24 +13,38 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_ebip.common.files import atomic_write, read_json, write_json
+from torch_ebip.common.files import write_json
 from torch_ebip.interaction.basis.selection import rank_candidates, select_basis, selection_table
 from torch_ebip.interaction.basis.stacked import StackedBasis
 from torch_ebip.interaction.filters import InteractionEnsembleFilter
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.kinematics import RobotArm
 from torch_ebip.learning.configuration import Task
+from torch_ebip.learning.drawing import Drawn, learn_drawing
+from torch_ebip.learning.groups import labelled
 from torch_ebip.learning.held_out import HeldOut
+from torch_ebip.learning.horizons import horizon_name, reached
 from torch_ebip.learning.interaction_model import NAME, InteractionModel
 from torch_ebip.learning.losses import ForwardKinematicsLoss
 from torch_ebip.learning.monitor import Monitor
 from torch_ebip.learning.objective import ForecastObjective, Weights, joints_of
+from torch_ebip.learning.partition import generator_of
+from torch_ebip.learning.place import enter, fingerprint
 from torch_ebip.learning.progress import Reporter
 from torch_ebip.learning.ranks import Ranks
+from torch_ebip.learning.recognising import learn_recognition
 from torch_ebip.learning.report import STAGES, Report, verdict_of
 from torch_ebip.learning.settings import TuningSettings
-from torch_ebip.learning.stages import Drawn, Scores, learn_shrinkage, reference_scores, score
-from torch_ebip.learning.starts import FACTORS, SHARPNESSES, Start, best_factor, best_start, scaled, tunable
+from torch_ebip.learning.stages import Scores, reference_scores, score
+from torch_ebip.learning.starts import (
+    FACTORS,
+    SHARPNESSES,
+    Start,
+    best_factor,
+    best_start,
+    scaled,
+    tunable,
+)
 from torch_ebip.learning.tuner import Tuner
 from torch_ebip.recordings.demonstrations import Demonstrations
 
@@ -39,10 +52,8 @@ FEWEST = 10
 """Demonstrations below which there is no gradient: those kept for validation would say nothing."""
 MOST = 100
 """Interactions that decide about shrinkage, at most."""
-RECORD = "learning.json"
-"""Of what a folder's learning is one of."""
-LEFT = ("checkpoint.pt", "report.json", "scan_scaled.json", "scan_tunable.json")
-"""What else a learning leaves there."""
+WEIGHING = ("start", "gradient")
+"""Stages whose filters remember what they saw, which a model of labelled interactions must."""
 
 
 @dataclass
@@ -57,6 +68,8 @@ class Procedure:
     scan: int
     steps: int
     shrink: bool
+    ahead: tuple[float, ...]
+    memories: int
     ranks: Ranks
 
     @property
@@ -68,6 +81,7 @@ class Procedure:
     def work(self) -> int:
         """Units: every filter that is tried, and every step."""
         tried = len(FACTORS) + 2 + 3 * len(SHARPNESSES)
+        tried += 2 + 2 * len(SHARPNESSES) if self.memories == 2 else 0
         return tried + (self.steps if self.tunes else 0) + 5
 
     def prepare(
@@ -81,47 +95,37 @@ class Procedure:
         basis = select_basis(self.known, ranking=self.ranking) if basis is None else basis
         self.primitive = primitive = InteractionPrimitive.fit(self.known, basis).to(self.ranks.device)
         targets = targets.to(primitive.weights.device)
+        given = self.known.labels
+        self.known, self.remarks = labelled(self.known, primitive, self.settings.seed, self.ranks)
+        labels = primitive.labels = self.known.labels
+        self.groups = {} if labels is None or labels == given else {label: labels.count(label) for label in labels}
+        ahead = self._horizons()
         if arm is None:
-            objective = ForecastObjective(primitive, targets)
+            objective = ForecastObjective(primitive, targets, ahead=ahead)
         else:
             loss = arm if isinstance(arm, ForwardKinematicsLoss) else ForwardKinematicsLoss(arm, rotation_weight=0.1)
             dofs = layout.mask(joints_of(loss.arm, layout, self.targets) if joints is None else [joints])
             objective = ForecastObjective(
-                primitive, targets, weights=Weights(tool=1.0), arm=loss, arm_dofs=dofs.to(targets.device)
+                primitive, targets, weights=Weights(tool=1.0), arm=loss, arm_dofs=dofs.to(targets.device), ahead=ahead
             )
         masks = {name: layout.mask(names).to(targets.device) for name, names in self.subsets.items()}
         self.task = Task(primitive, objective, targets, masks)
         self.held_out = HeldOut(self.known, self.task, self.settings, self.ranks)
 
-    def enter(self, place: Path) -> InteractionModel | None:
-        """The model of a folder where this learning was finished; otherwise the folder becomes one of it.
+    def _horizons(self) -> list[float]:
+        """The horizons that enough demonstrations reach; of the others the report says so."""
+        there = reached(self.primitive, self.ahead)
+        short = [horizon_name(a) for a in self.ahead if a not in there]
+        if short:
+            self.remarks.append(
+                f"not scored, because hardly any demonstration goes on for so long: {', '.join(short)}"
+            )
+        return there
 
-        Raises:
-            ValueError: a folder of another learning.
-        """
-        record, ours = place / RECORD, self.identity()
-        if record.exists():
-            theirs = read_json(record)
-            differing = [key for key in ours if not isinstance(theirs, dict) or theirs.get(key) != ours[key]]
-            if differing:
-                there = theirs.get(differing[0]) if isinstance(theirs, dict) else theirs
-                raise ValueError(
-                    f"{place}: another learning's folder: {differing[0]} is {str(there)[:200]} there and "
-                    f"{str(ours[differing[0]])[:200]} here"
-                )
-        elif self.ranks.first:
-            there = [name for name in (NAME, *LEFT) if (place / name).exists()]
-            if there:
-                raise ValueError(
-                    f"{place}: holds {', '.join(there)}, but not {RECORD}: nothing says of which learning"
-                )
-            write_json(record, ours)
-            if self.ranking is not None:
-                with atomic_write(place / "basis.txt") as file:
-                    file.write(f"{selection_table(self.ranking)}\n".encode())
-        self.ranks.from_first(lambda: None)  # none goes on before the record is there
-        finished = record.exists() and (place / NAME).exists()
-        return InteractionModel.load(place / NAME) if finished else None
+    def enter(self, place: Path) -> InteractionModel | None:
+        """See `place.enter`."""
+        basis = None if self.ranking is None else selection_table(self.ranking)
+        return enter(place, self.identity(), basis, self.ranks)
 
     def identity(self) -> dict[str, Any]:
         """Everything on which the result depends, as JSON gives it back."""
@@ -138,6 +142,8 @@ class Procedure:
             "arm": None if objective.arm is None else f"{objective.arm}; {objective.arm.arm.meant()}",
             "joints": objective.joints,
             "shrink": self.shrink,
+            "ahead": [horizon_name(a) for a in self.ahead],
+            "memories": self.memories,
             "scan": self.scan,
             "steps": self.steps,
             "settings": {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(self.settings).items()},
@@ -164,11 +170,13 @@ class Procedure:
                 raise
             interrupted = True
         interrupted = interrupted or self.said.get("interrupted_at") is not None
-        chosen = min(self.filters, key=lambda name: self.scores[name]["loss"])
+        names = [name for name in self.filters if self.known.labels is None or name in WEIGHING] or list(self.filters)
+        chosen = min(names, key=lambda name: self.scores[name]["loss"])
         drawn = None
         if not interrupted:
             try:
                 drawn = self._draw(self.filters[chosen])
+                self._recognise(self.filters[chosen])
             except KeyboardInterrupt:
                 interrupted = True
         return self._finish(chosen, drawn, interrupted)
@@ -195,7 +203,7 @@ class Procedure:
         self._stage("factor", scaled(primitive, factor, self.members))
         self.reporter.stage("start")
         record = None if self.place is None else self.place / "scan_tunable.json"
-        start = best_start(held_out, factor, self.scan, self.members, record, tick)
+        start = best_start(held_out, factor, self.scan, self.members, record, tick, self.memories)
         self.said |= {"factor": factor, "start": start._asdict()}
         self._stage("start", tunable(primitive, start, self.members))
 
@@ -230,18 +238,25 @@ class Procedure:
         self.filters["gradient"] = filter
 
     def _draw(self, filter: InteractionEnsembleFilter) -> Drawn:
-        """How far the forecasts of a filter are drawn towards the mean."""
+        """How far the forecasts of a filter are drawn towards the mean, and how wide they are."""
         self.reporter.stage("shrinkage")
         # Those that are scored first: they are the beginning of the order.
         partition = self.held_out.partition
         some = torch.cat([partition.validating, partition.training])[: max(MOST, len(self.scored))]
-        drawn = learn_shrinkage(self.held_out, filter, some, self.scored)
+        drawn = learn_drawing(self.held_out, filter, some, self.scored)
         if self.shrink:
             filter.readout = drawn.readout
             self.said["shrinkage"] = drawn.shares
-            self.scores["shrinkage"] = {"error": drawn.error}
+            self.scores["shrinkage"] = drawn.scores
         self.reporter.tick()
         return drawn
+
+    def _recognise(self, filter: InteractionEnsembleFilter) -> None:
+        """How sure the filter may be of a label."""
+        labels = self.known.labels
+        if labels is not None and len(set(labels)) > 1:
+            order = torch.randperm(len(labels), generator=generator_of(self.settings.seed, -2), device="cpu")[:MOST]
+            filter.recognition, self.said["recognition"] = learn_recognition(self.held_out, filter, labels, order)
 
     def _finish(self, chosen: str, drawn: Drawn | None, interrupted: bool) -> InteractionModel:
         """Report and keep."""
@@ -262,6 +277,9 @@ class Procedure:
                 "stages": stages,
                 "interactions": len(self.scored),
                 "demonstrations": len(self.known),
+                "horizons": list(self.task.objective.horizons or ()),
+                "remarks": self.remarks,
+                "groups": self.groups,
                 "interrupted": interrupted,
                 **self.said,
                 "basis": {m.name: str(basis.bases[layout.slice(m.name).start]) for m in layout.modalities},
@@ -275,18 +293,8 @@ class Procedure:
                 "seconds": round(time.monotonic() - self.began, 1),
             }
         )
-        model = InteractionModel(filter, self.primitive, report, self.targets, self.known.labels)
+        model = InteractionModel(filter, self.primitive, report, self.targets)
         if self.place is not None and self.ranks.first and not report["interrupted"]:
             write_json(self.place / "report.json", report.plain())
             model.save(self.place / NAME)
         return model
-
-
-def fingerprint(demonstrations: Demonstrations) -> str:
-    """Sixteen hexadecimal digits that change with any value, their order, their number or their kind."""
-    digest = hashlib.sha256()
-    for trajectory in demonstrations:
-        values = trajectory.detach().cpu().contiguous()
-        digest.update(f"{values.dtype} {list(values.shape)}".encode())
-        digest.update(values.nan_to_num(nan=1e30).numpy().tobytes())
-    return digest.hexdigest()[:16]

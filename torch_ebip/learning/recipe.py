@@ -5,9 +5,11 @@ Every stage is scored on interactions that its ensembles do not contain, and the
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from torch_ebip.common.ambient import in_own_modes
 from torch_ebip.common.arguments import as_count
 from torch_ebip.interaction.basis.stacked import StackedBasis
 from torch_ebip.kinematics import RobotArm
+from torch_ebip.learning.horizons import AHEAD
 from torch_ebip.learning.interaction_model import InteractionModel
 from torch_ebip.learning.losses import ForwardKinematicsLoss
 from torch_ebip.learning.monitor import Monitor
@@ -41,6 +44,8 @@ def learn(
     joints: str | None = None,
     basis: StackedBasis | None = None,
     shrink: bool = True,
+    ahead: Sequence[float] = AHEAD,
+    memories: int = 2,
     scan: int = 48,
     ranks: Ranks | None = None,
     **tuning: Any,
@@ -48,7 +53,8 @@ def learn(
     """The whole recipe, from recordings to a model that can be kept, loaded and run.
 
     Basis by BIC, the closed form, the best single factor on R, the best start of the tuned filter, the gradient, and
-    how far forecasts are drawn towards the training mean. `InteractionModel.report` says what each gave on
+    how far forecasts are drawn towards the training mean. The next 0.1, 0.25, 0.5 and 1 s and the end count alike.
+    Where nobody labelled the demonstrations groups are looked for. `InteractionModel.report` says what each gave on
     interactions left out. With fewer than ten demonstrations there is no gradient, because nothing could tell when to
     stop; with fewer than twenty the pull towards the start is stronger.
 
@@ -68,7 +74,9 @@ def learn(
         joints: name of the target that holds the arm's joints (rad, or m where one slides); default: the one whose
             DoFs have their names, or are as many.
         basis: default: `select_basis`.
-        shrink: whether forecasts are drawn towards the training mean, see `Shrinkage`.
+        shrink: whether forecasts are drawn towards the training mean, see `HorizonShrinkage`.
+        ahead: horizons that count alike, in s, increasing; the last is infinity, the end.
+        memories: of the evidence: 2, a fast and a slow one, or the fast one alone.
         scan: how many interactions decide where the gradient starts.
         ranks: the processes that share the work; default: this one.
         tuning: further settings of `TuningSettings`, such as ``batch_size``.
@@ -111,9 +119,14 @@ def learn(
     strangers = {name for names in shown.values() for name in names} - set(sensors)
     if strangers:
         raise ValueError(f"subsets name {', '.join(sorted(strangers))}; the sensors are {', '.join(sensors)}")
+    ahead = tuple(float(a) for a in ahead)
+    if not ahead or not math.isinf(ahead[-1]) or any(b <= a for a, b in pairwise(ahead)):
+        raise ValueError(f"ahead must be increasing seconds, math.inf (the end) the last, got {list(ahead)}")
+    if as_count("memories", memories) > 2:
+        raise ValueError(f"memories must be 1 or 2, got {memories}")
     settings = settings_for(known, max(steps, 1), seed, members, tuning)
     ranks = Ranks() if ranks is None else ranks
-    run = Procedure(known, tuple(targets), shown, settings, members, scan, steps, shrink, ranks)
+    run = Procedure(known, tuple(targets), shown, settings, members, scan, steps, shrink, ahead, memories, ranks)
     run.prepare(arm, joints, basis)
     place = None if folder is None else Path(folder)
     if place is not None:

@@ -47,6 +47,7 @@ def forecast_recorded(
     size = filter.initial_state(generator=seeded(seed))[0].numel() * like.element_size() * len(ahead)
     portion = max(1, PORTION // size)
     means, variances, phases = [], [], []
+    labels: dict[str, list[torch.Tensor]] = {}
     for some, seen in zip(torch.split(y, portion), torch.split(observed, portion), strict=True):
         if state is not None:
             state = filter.predict(state, filter.dt, generator)
@@ -57,4 +58,8 @@ def forecast_recorded(
         means.append(said.mean)
         variances.append(said.variance)
         phases.append(said.phase)
-    return Forecast(torch.cat(means), torch.cat(variances), torch.cat(phases))
+        if filter.recognition is not None:
+            for label, probability in filter.recognise(trace.kept).items():
+                labels.setdefault(label, []).append(probability)
+    together = {label: torch.cat(parts) for label, parts in labels.items()} or None
+    return Forecast(torch.cat(means), torch.cat(variances), torch.cat(phases), labels=together)

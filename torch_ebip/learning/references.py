@@ -14,6 +14,42 @@ def ends(primitive: InteractionPrimitive) -> Tensor:
     return primitive.basis.project(one, primitive.weights)
 
 
+def last_measured(trajectory: Tensor) -> Tensor:
+    """[D]: the last measured value of each DoF of a trajectory [T, D], NaN if the last twentieth has none.
+
+    Args:
+        trajectory: [T, D], units of the DoFs, NaN where not measured.
+    """
+    recent = trajectory[-max(1, len(trajectory) // 20) :]
+    steps = torch.arange(len(recent), device=recent.device).unsqueeze(-1)
+    last = torch.where(recent.isnan(), -1, steps).amax(0)
+    return torch.where(last >= 0, recent.gather(0, last.clamp(min=0).unsqueeze(0))[0], torch.nan)
+
+
+def recorded(values: Tensor, lengths: Tensor, ends: Tensor, now: Tensor, ahead: Tensor, rate: float) -> Tensor:
+    """What was measured some seconds after some samples: [B, K, P, D].
+
+    Between samples linear; NaN where it was not measured, or is behind the end. Infinitely far ahead: the end.
+
+    Args:
+        values: [B, T, D], units of the DoFs, NaN where not measured.
+        lengths: int64 [B], samples.
+        ends: [B, D], see `last_measured`.
+        now: int64 [B, K], samples.
+        ahead: [P], s.
+        rate: samples a second, Hz.
+    """
+    last = (lengths - 1).view(-1, 1, 1)
+    at = now.unsqueeze(-1) + torch.where(ahead.isinf(), 0, ahead).double() * rate
+    before = (at + 1e-6).floor().long()
+    part = (at - before).clamp(min=0).to(values).unsqueeze(-1)
+    rows = torch.arange(len(values), device=values.device).view(-1, 1, 1)
+    first, second = (values[rows, torch.minimum(step, last)] for step in (before, before + 1))
+    found = torch.where(part > 1e-6, torch.lerp(first, second, part), first)
+    found = torch.where((at <= last + 1e-6).unsqueeze(-1), found, torch.nan)
+    return torch.where(ahead.isinf().view(-1, 1), ends.view(len(values), 1, 1, -1), found)
+
+
 def nearest(
     primitive: InteractionPrimitive,
     y: Tensor,

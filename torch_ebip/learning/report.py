@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 STAGES = ("mean", "nearest", "closed_form", "factor", "start", "gradient", "shrinkage")
@@ -13,13 +13,19 @@ CLEAR = 2.5
 """Standard errors that a gain must have: options were chosen on some of the interactions that it is measured on."""
 
 
+BOTH = "better than both"
+MEAN = "better than the training mean, not than the nearest demonstration"
+NEITHER = "no better than the training mean, as far as so many tell"
+
+
 class Report(Mapping[str, Any]):
     """What `learn` says of a model. It is read like a dictionary, printed as a table, and cannot be changed.
 
     Entries, as far as there is something to say: ``verdict``, ``stages`` (scores by stage: see `STAGES`), ``chosen``
     (the stage whose filter the model has), ``interactions`` (how many were left out to score them),
     ``demonstrations``, ``factor``, ``start``, ``validation`` (loss by step), ``best_step``, ``stopped_early``,
-    ``shrinkage`` (shares by target, one for each of `LEADS`), ``basis``, ``settings``, ``versions``, ``seconds``.
+    ``shrinkage`` (mean shares by target and horizon), ``horizons``, ``remarks`` (what was left out, and why),
+    ``basis``, ``settings``, ``versions``, ``seconds``.
 
     Args:
         content: plain values.
@@ -59,7 +65,7 @@ class Report(Mapping[str, Any]):
         if not stages:
             return self.verdict
         columns = list(dict.fromkeys(key for scores in stages.values() for key in scores if _shown(key)))
-        rows = [["stage", *columns]]
+        rows = [["stage", *(column.removeprefix("error/") for column in columns)]]
         for stage, scores in stages.items():
             name = f"{stage} *" if stage == self._content.get("chosen") else stage
             rows.append([name, *(f"{scores[key]:.4g}" if key in scores else "-" for key in columns)])
@@ -67,18 +73,18 @@ class Report(Mapping[str, Any]):
         lines = [
             "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
         ]
-        return "\n".join([*lines, self.verdict])
+        return "\n".join([*lines, *self._content.get("remarks", ()), self.verdict])
 
 
 def _shown(key: str) -> bool:
-    return key in ("loss", "error", "coverage_95") or key.startswith("mae/")
+    return key in ("loss", "error", "coverage_95") or key.startswith(("error/", "mae/"))
 
 
 def verdict_of(
     stages: Mapping[str, Mapping[str, float]],
     chosen: str,
     interactions: int,
-    gain: float | None,
+    gain: Mapping[str, float] | None,
     reason: str | None,
 ) -> str:
     """What the scores of the stages come to.
@@ -87,21 +93,36 @@ def verdict_of(
         stages: their scores; ``mean`` and ``nearest`` among them.
         chosen: the stage whose filter was kept.
         interactions: how many were left out.
-        gain: standard errors by which the squared error is less than the training mean's; None if nobody looked.
+        gain: by horizon, standard errors by which the squared error is less than the training mean's; None if nobody
+            looked.
         reason: why there was no gradient, or less of it than was asked for; None if there was.
     """
-    last = stages.get("shrinkage", stages[chosen])["error"]
-    mean, nearest = stages["mean"]["error"], stages["nearest"]["error"]
+    last, mean, nearest = stages.get("shrinkage", stages[chosen]), stages["mean"], stages["nearest"]
     if gain is None:
         said = "not compared"
-    elif gain < CLEAR or last >= 0.95 * mean:
-        said = "no better than the training mean, as far as so many tell"
-    elif last < 0.95 * nearest:
-        said = "better than both"
     else:
-        said = "better than the training mean, not than the nearest demonstration"
+        kinds: dict[str, list[str]] = {BOTH: [], MEAN: [], NEITHER: []}
+        for horizon, errors in gain.items():
+            key = f"error/{horizon}"
+            if key not in last or key not in mean:
+                continue
+            if errors < CLEAR or last[key] >= 0.95 * mean[key]:
+                kinds[NEITHER].append(horizon)
+            elif last[key] < 0.95 * nearest[key]:
+                kinds[BOTH].append(horizon)
+            else:
+                kinds[MEAN].append(horizon)
+        there = {kind: horizons for kind, horizons in kinds.items() if horizons}
+        said = "; ".join(kind if len(there) == 1 else f"{kind} {_at(horizons)}" for kind, horizons in there.items())
     text = (
-        f"{said}: at the end {last:.2f} of the targets' spread off, the training mean {mean:.2f}, the nearest "
-        f"demonstration {nearest:.2f}, on {interactions} interactions left out of their ensembles"
+        f"{said or 'not compared'}: {last['error']:.2f} of the targets' spread off, the training mean "
+        f"{mean['error']:.2f}, the nearest demonstration {nearest['error']:.2f}, on {interactions} interactions left "
+        "out of their ensembles"
     )
     return f"{text}; {reason}" if reason else text
+
+
+def _at(horizons: Sequence[str]) -> str:
+    """``at 0.1 s, 0.25 s and the end``."""
+    named = ["the end" if horizon == "end" else horizon for horizon in horizons]
+    return f"at {named[0]}" if len(named) == 1 else f"at {', '.join(named[:-1])} and {named[-1]}"

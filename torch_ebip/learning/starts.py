@@ -1,4 +1,4 @@
-"""Where the gradient starts: a factor on the closed-form R, and how sharply the evidence weighs.
+"""Where the gradient starts: a factor on the closed-form R, how sharply the evidence weighs, how far back it looks.
 
 Both are searched for on interactions that are left out. One factor is what a sceptic does instead of gradients.
 """
@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from itertools import product
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,15 +27,25 @@ FACTORS = (1.0, 10.0, 100.0, 1000.0, 10000.0)
 """Coarse grid of factors on the closed-form R; the best one is refined by half-decades."""
 SHARPNESSES = (3.16, 10.0, 31.6)
 """Of the evidence weights, tried with every half-decade of R up to the best factor."""
+FORGETTING = (6.0, 0.01)
+"""Rates of the memories, 1/s: a sixth of a second, and the whole interaction."""
+MEMORIES = ((0.5, 0.0), (0.95, 0.0), (0.05, 0.0), (0.5, 4.0), (0.05, 4.0))
+"""Shares of the fast memory in the sharpness, and the primacy of the slow one: how much more it holds of what came
+first. The first pair is tried with every sharpness, others without primacy with the best, with it with every one."""
 INFLATION = 1.002
 """Of the anomalies a sample, where the gradient starts."""
 
 
 class Start(NamedTuple):
-    """Where the gradient starts: a factor on R, and the sharpness of the evidence weights."""
+    """Where the gradient starts: a factor on R, the sharpness of the evidence weights, and the memories.
+
+    ``balance`` is the fast memory's share of the sharpness, None if it is alone; ``primacy`` is the slow one's.
+    """
 
     factor: float
     sharpness: float
+    balance: float | None = None
+    primacy: float = 0.0
 
 
 def scaled(primitive: InteractionPrimitive, factor: float, members: int | None = None) -> InteractionEnsembleFilter:
@@ -54,6 +64,9 @@ def tunable(
         members: E; default: all demonstrations.
         robust: what surprising measurements count; default: as much as others.
     """
+    sharpness: list[float] | float = start.sharpness
+    if start.balance is not None:
+        sharpness = [start.balance * start.sharpness, (1 - start.balance) * start.sharpness]
     return ebip(
         primitive,
         members,
@@ -63,7 +76,9 @@ def tunable(
         inflation=AboveOne(primitive.weights.new_tensor(INFLATION)),
         square_root=True,
         weigh=True,
-        sharpness=start.sharpness,
+        sharpness=sharpness,
+        forgetting=FORGETTING[0] if start.balance is None else FORGETTING,
+        primacy=0.0 if start.balance is None else (0.0, start.primacy),
     )
 
 
@@ -126,8 +141,9 @@ def best_start(
     members: int | None = None,
     record: Path | None = None,
     tick: Callable[[], None] = lambda: None,
+    memories: int = 2,
 ) -> Start:
-    """The start of `tunable` with the smallest loss, among half-decades of R up to a factor, and `SHARPNESSES`.
+    """The start of `tunable` with the smallest loss: half-decades of R up to a factor, `SHARPNESSES`, `MEMORIES`.
 
     The factor is the best one without evidence weights, which take over a part of what a large R is for.
 
@@ -138,25 +154,36 @@ def best_start(
         members: E of the filter.
         record: file of the losses, written when all are known; if it exists, its best start is returned.
         tick: called after each filter that was tried.
+        memories: 2, a fast and a slow one; or 1.
 
     Raises:
         ValueError: a record that is none.
     """
     if record is None or not record.exists():
         order = scanned(held_out, interactions)
-        losses: list[dict[str, float]] = []
-        for half, sharpness in product((-1.0, -0.5, 0.0), SHARPNESSES):
-            start = Start(float(f"{factor * 10**half:.4g}"), sharpness)
+        losses: list[dict[str, Any]] = []
+        pairs: Sequence[tuple[float | None, float]] = MEMORIES if memories == 2 else [(None, 0.0)]
+
+        def measure(start: Start) -> None:
+            """The loss of a filter that starts there."""
             filter = tunable(held_out.task.primitive, start, members)
             losses.append({**start._asdict(), "loss": held_out.evaluate(filter, order)["loss"]})
             tick()
+
+        for half, sharpness in product((-1.0, -0.5, 0.0), SHARPNESSES):
+            measure(Start(float(f"{factor * 10**half:.4g}"), sharpness, *pairs[0]))
+        first = min(losses, key=lambda entry: _loss(entry["loss"]))
+        for pair in pairs[1:]:
+            # What came first tells little of where a hand is now: it takes more sharpness to be heard.
+            for sharpness in SHARPNESSES if pair[1] else (first["sharpness"],):
+                measure(Start(first["factor"], sharpness, *pair))
         if record is not None and held_out.ranks.first:
             write_json(record, losses)
     else:
         losses = read_json(record)
     try:
         best = min(losses, key=lambda entry: _loss(entry["loss"]))
-        return Start(best["factor"], best["sharpness"])
+        return Start(best["factor"], best["sharpness"], best["balance"], best["primacy"])
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{record}: expected a list of starts with their losses: {error}") from error
 

@@ -37,6 +37,9 @@ class Engine(Protocol):
     def forecast(self, phase: Tensor) -> Forecast:
         """Of the controlled DoFs at phases [P]."""
 
+    def labels(self) -> dict[str, float]:
+        """Probability of each label; empty where the filter cannot say."""
+
 
 def make_engine(filter: InteractionFilter, sensors: Tensor, controlled: Tensor, slots: int, seed: int) -> Engine:
     """The faster of the two that serves a filter.
@@ -89,6 +92,13 @@ class _LiveEngine:
     def forecast(self, phase: Tensor) -> Forecast:
         """See `Engine`."""
         return self._live.forecast(phase, self._controlled)
+
+    def labels(self) -> dict[str, float]:
+        """See `Engine`."""
+        live = self._live
+        if live.filter.recognition is None or live.carrier.memory.weighting is None:
+            return {}
+        return {label: float(probability) for label, probability in live.recognise().items()}
 
 
 def _tensors(state: Any) -> list[Tensor]:
@@ -146,3 +156,11 @@ class _StateEngine:
     def forecast(self, phase: Tensor) -> Forecast:
         """See `Engine`."""
         return self._filter.forecast(self._state, phase).select(self._controlled.to(phase.device))
+
+    @torch.no_grad()
+    def labels(self) -> dict[str, float]:
+        """See `Engine`."""
+        memory = getattr(self._state, "memory", None)
+        if self._filter.recognition is None or memory is None or memory.weighting is None:
+            return {}
+        return {label: float(p) for label, p in self._filter.recognise(self._state).items()}

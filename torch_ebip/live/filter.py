@@ -22,8 +22,8 @@ from torch_ebip.filtering.carriers.checks import measured_dofs
 from torch_ebip.filtering.carriers.plan import kept
 from torch_ebip.filtering.carriers.span import SpanCarrier
 from torch_ebip.filtering.states import EnsembleState, Memory
-from torch_ebip.interaction.filters import InteractionEnsembleFilter, Phases
-from torch_ebip.interaction.forecast import Forecast
+from torch_ebip.interaction.filters import InteractionEnsembleFilter
+from torch_ebip.interaction.forecast import Forecast, Phases
 
 
 class LiveSnapshot(NamedTuple):
@@ -168,6 +168,12 @@ class LiveFilter:
         chosen = (True,) * D if dofs is None else tuple(as_mask("dofs", dofs, D).tolist())
         part, columns = kept(self._forecasters, chosen, self._make_forecaster)
         return part.forecast(self.carrier.state(columns), phase, ahead=ahead)
+
+    @in_own_modes
+    @torch.no_grad()
+    def recognise(self) -> dict[str, Tensor]:
+        """See `InteractionFilter.recognise`; nothing that sensors do not see is brought up to date for it."""
+        return self.filter.recognised(self.carrier.memory, self.phase)
 
     @in_own_modes
     @torch.no_grad()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 from torch import Tensor
@@ -22,6 +24,7 @@ class SessionForecast(NamedTuple):
         mean, deviation: [D_c], or [P, D_c] for P horizons: expected values and their standard deviations.
         stale: names of the sensors of which nothing was used for a while, or ever.
         horizon: seconds from the present that were asked for, P of them; empty for the end alone.
+        labels: probability of each of the labelled interactions, by name; empty where there are none.
     """
 
     time: float
@@ -32,6 +35,7 @@ class SessionForecast(NamedTuple):
     deviation: Tensor
     stale: tuple[str, ...]
     horizon: tuple[float, ...] = ()
+    labels: Mapping[str, float] = MappingProxyType({})
 
     def __repr__(self) -> str:
         return brief(self)

@@ -178,7 +178,8 @@ class InteractionSession:
             phase = min(max(phase, 0.0), 1.0)
             left = (1 - phase) / velocity if velocity > 0 else math.inf
             now, stale = self._timeline.now, tuple(self.sensors[i] for i in self._timeline.stale())
-            return SessionForecast(now, phase, left, self.dofs, mean, deviation, stale, tuple(horizons))
+            labels = self._timeline.labels()
+            return SessionForecast(now, phase, left, self.dofs, mean, deviation, stale, tuple(horizons), labels)
 
     @property
     def failed_updates(self) -> int:

@@ -159,6 +159,10 @@ class Timeline:
         """Of the controlled DoFs at some phases."""
         return self._engine.forecast(self._like.new_tensor(phases))
 
+    def labels(self) -> dict[str, float]:
+        """Probability of each label."""
+        return self._engine.labels()
+
     def stale(self) -> list[int]:
         """Numbers of the sensors of which nothing was used for a while, or ever."""
         oldest = self._now - self.settings.stale_after

@@ -97,6 +97,15 @@ class Demonstrations:
         column = self.columns.get("labels")
         return None if column is None or column.ndim != 1 else tuple(str(label) for label in column.tolist())
 
+    def labelled(self, labels: Sequence[str]) -> Demonstrations:
+        """The same recordings with labels, N names, whatever they had before.
+
+        Raises:
+            ValueError: labels that are not N names.
+        """
+        others = {name: column for name, column in self.columns.items() if name != "labels"}
+        return Demonstrations(self.layout, self.trajectories, self.rate, others, labels)
+
     def assign(self, targets: Sequence[str] | None = None, sensors: Sequence[str] | None = None) -> Demonstrations:
         """The same recordings with other roles: what is forecast is controlled, what is shown is not.
 

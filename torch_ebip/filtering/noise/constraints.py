@@ -81,6 +81,20 @@ class Positive(Constrained):
         return self.floor + (1 - self.floor) * self.raw.exp()
 
 
+class Signed(Constrained):
+    """A number of either sign: start + raw."""
+
+    @staticmethod
+    def _check(start: Tensor) -> None:
+        if not bool(start.isfinite().all()):
+            raise ValueError(f"a parameter must start at a finite number, got {start}")
+
+    @property
+    def value(self) -> Tensor:
+        """Values [...], shape of `start`."""
+        return self.start + self.raw
+
+
 class AboveOne(Constrained):
     """A factor above 1, such as an inflation: 1 + (start - 1) exp(raw)."""
 
