@@ -6,6 +6,7 @@ import argparse
 import io
 import os
 import sys
+import threading
 from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import nullcontext
@@ -31,6 +32,7 @@ def command(main: Callable[[list[str] | None], None]) -> Callable[[list[str] | N
         for stream in (sys.stdout, sys.stderr):
             if isinstance(stream, io.TextIOWrapper):
                 stream.reconfigure(errors="replace")
+        threading.excepthook = _in_a_line
         alone = arguments is None and "TORCHELASTIC_RUN_ID" not in os.environ  # torchrun ends its processes itself
         try:
             with interruptible() if alone else nullcontext():
@@ -41,8 +43,18 @@ def command(main: Callable[[list[str] | None], None]) -> Callable[[list[str] | N
             ) from error
         except OSError as error:
             raise SystemExit(f"{error}; {GOES_ON}") from error
+        finally:
+            threading.excepthook = threading.__excepthook__
 
     return run
+
+
+def _in_a_line(failure: threading.ExceptHookArgs) -> None:
+    """What a thread died of: of a disk, as TensorBoard's writer may, without its stack."""
+    if issubclass(failure.exc_type, OSError):
+        print(failure.exc_value, file=sys.stderr)
+    else:
+        threading.__excepthook__(failure)
 
 
 def experiment_parser(name: str, description: str | None) -> argparse.ArgumentParser:

@@ -49,7 +49,7 @@ def undisturbed(command: list[str], tmp_path_factory: pytest.TempPathFactory) ->
 
 
 @pytest.mark.skipif(not can_mount(), reason="this machine lets nobody mount a small disk")
-@pytest.mark.parametrize("size", ["64k", "300k"])  # a checkpoint does not fit, a figure does not
+@pytest.mark.parametrize("size", ["64k", "96k", "300k"])  # a checkpoint does not fit, a figure does not
 def test_a_full_disk_is_named_and_costs_nothing(
     size: str, command: list[str], undisturbed: Path, tmp_path: Path
 ) -> None:

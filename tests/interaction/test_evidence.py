@@ -57,7 +57,7 @@ def test_weights_are_those_of_the_formula(sharpness: list[float], rates: list[fl
             likelihood = np.exp(-temper * squares[..., observed[t]].mean(-1)) @ (prior / prior.sum())
             held = np.exp(-0.7 * (phases[t].item() - 0.5))
             misfit, seen = misfit - held * np.log(likelihood) / temper, seen + held
-            logits = -(tempers[:, None] * misfit / np.maximum(seen, 1)[:, None]).sum(0)
+            logits = -(tempers[:, None] * misfit / np.maximum(seen, held)[:, None]).sum(0)
             soft = np.exp(logits - logits.max())
             weights = 0.98 * soft / soft.sum() + 0.02 / 7
         np.testing.assert_allclose(evidence.weights.detach().numpy(), weights, atol=1e-12, err_msg=f"sample {t}")

@@ -243,7 +243,7 @@ class EvidenceWeighting(Weighting):
         misfit = evidence.misfit - held.unsqueeze(-1) * (likelihood / temper).unsqueeze(-2)
         total = evidence.seen + held * samples
         # Less than one sample, where values are not trusted, counts as little as it is: it is not scaled up to one.
-        shares = tempers / -total.clamp(min=1)
+        shares = tempers / -torch.maximum(total, held)
         weights = torch.softmax((misfit * shares.unsqueeze(-1)).sum(-2), dim=-1)
         weights = (1 - self.defensive) * weights + self.defensive / weights.shape[-1]
         if observed is not None:
