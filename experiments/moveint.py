@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from experiments.baselines.mixture import MixtureNetwork
+from experiments.baselines.mixture import EPOCHS, MixtureNetwork
 from experiments.folds import mean_of_cells, read_values, run_folds, share_cores, write_values
 from experiments.results import Cell, Values, print_tables, summarise
 from experiments.run_folder import RunFolder
@@ -43,6 +43,7 @@ class Job:
     data: str
     seed: int
     steps: int
+    epochs: int
     methods: tuple[str, ...]
     threads: int
     folder: str
@@ -79,7 +80,7 @@ def run_seed(job: Job) -> Values:
     for name in job.methods:
         if name == "mixture_gru":
             y, _ = tests.pad()
-            said = MixtureNetwork(known, AHEAD, job.seed)(y)
+            said = MixtureNetwork(known, AHEAD, job.seed, job.epochs)(y)
         elif name in ("mean", "nearest"):
             said = _reference(name, known, tests)
         else:
@@ -161,14 +162,22 @@ def run(options: argparse.Namespace, arguments: list[str] | None) -> None:
         raise SystemExit("--protocol moveint needs --data: recordings with the columns split and action")
     known, tests = parts(options.data)
     methods = tuple(name for name in METHODS if name in options.methods or name == "mixture_gru")
-    seeds, steps = (1, min(options.steps, 5)) if options.quick else (3, options.steps)
+    seeds, steps, epochs = (1, min(options.steps, 5), 40) if options.quick else (3, options.steps, EPOCHS)
     settings = {"data": options.data, "protocol": "moveint", "seeds": seeds, "seed": options.seed, "steps": steps,
-                "methods": list(methods)}  # fmt: skip
+                "epochs": epochs, "methods": list(methods)}  # fmt: skip
     run = RunFolder("compare", settings, options.out, options.force, arguments)
     print(f"{known}\ntests: {len(tests)}")
     workers, threads = share_cores(seeds, options.workers)
     jobs = [
-        Job(options.data, options.seed + s, steps, methods, threads, str(run.path / f"seed-{options.seed + s}"))
+        Job(
+            options.data,
+            options.seed + s,
+            steps,
+            epochs,
+            methods,
+            threads,
+            str(run.path / f"seed-{options.seed + s}"),
+        )
         for s in range(seeds)
     ]
     for job in jobs:

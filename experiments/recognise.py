@@ -44,6 +44,7 @@ class Job:
     folds: int
     data: str | None
     labels: str
+    training: int
     tests: int
     steps: int
     memories: int
@@ -54,7 +55,7 @@ class Job:
     def parts(self) -> tuple[Demonstrations, Demonstrations]:
         """What is learned from, and what is asked about."""
         if self.data is None:
-            return actions(TRAINING, 2 * self.seed + 1), actions(self.tests, 2 * self.seed + 2)
+            return actions(self.training, 2 * self.seed + 1), actions(self.tests, 2 * self.seed + 2)
         demonstrations = labelled(self.data, self.labels)
         training, testing = split(len(demonstrations), self.folds, self.fold, self.seed)
         return demonstrations.subset(training), demonstrations.subset(testing)
@@ -157,12 +158,13 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the experiment from the command line."""
     options = _parser().parse_args(arguments)
     began = time.monotonic()
-    tests, steps, folds = options.tests, options.steps, options.folds if options.data else 1
+    training, tests, steps, folds = TRAINING, options.tests, options.steps, options.folds if options.data else 1
     if options.quick:
-        tests, steps, folds = min(tests, 100), min(steps, 5), min(folds, 2)
+        training, tests, steps, folds = 40, min(tests, 100), min(steps, 5), min(folds, 2)
     settings = {
         "data": options.data,
         "labels": options.labels if options.data else None,
+        "training": None if options.data else training,
         "tests": None if options.data else tests,
         "folds": folds,
         "steps": steps,
@@ -174,8 +176,8 @@ def main(arguments: list[str] | None = None) -> None:
     run = RunFolder("recognise", settings, options.out, options.force, arguments)
     workers, threads = share_cores(folds, options.workers)
     jobs = [
-        Job(fold, folds, options.data, options.labels, tests, steps, options.memories, options.seed, threads,
-            str(run.path / f"fold-{fold:02d}"))
+        Job(fold, folds, options.data, options.labels, training, tests, steps, options.memories, options.seed,
+            threads, str(run.path / f"fold-{fold:02d}"))
         for fold in range(folds)
     ]  # fmt: skip
     for job in jobs:

@@ -43,9 +43,10 @@ class RecurrentClassifier:
         demonstrations: with labels; of the training part.
         inputs: bool [D], DoFs that are shown.
         seed: of the network, the training and the draws.
+        rounds: gradient steps at most.
     """
 
-    def __init__(self, demonstrations: Demonstrations, inputs: Tensor, seed: int = 0) -> None:
+    def __init__(self, demonstrations: Demonstrations, inputs: Tensor, seed: int = 0, rounds: int = ROUNDS) -> None:
         labels = demonstrations.labels
         assert labels is not None
         self.labels, self.inputs = tuple(dict.fromkeys(labels)), inputs
@@ -65,7 +66,7 @@ class RecurrentClassifier:
             network = _Network(int(inputs.sum()), len(self.labels))
             optimiser = torch.optim.AdamW(network.parameters(), lr=5e-3, weight_decay=1e-2)
             best, best_loss, waited = copy.deepcopy(network), float("inf"), 0
-            for step in range(1, ROUNDS + 1):
+            for step in range(1, rounds + 1):
                 network.train()
                 chosen = training[torch.randint(len(training), (64,), generator=generator)]
                 offset = torch.randint(self.every, (len(chosen),), generator=generator)

@@ -49,9 +49,10 @@ class MixtureNetwork:
         demonstrations: whose controlled DoFs are forecast from the others.
         ahead: how many samples.
         seed: of the network, the training and the draws.
+        epochs: at most.
     """
 
-    def __init__(self, demonstrations: Demonstrations, ahead: int = 5, seed: int = 0) -> None:
+    def __init__(self, demonstrations: Demonstrations, ahead: int = 5, seed: int = 0, epochs: int = EPOCHS) -> None:
         self.ahead, self.targets = ahead, demonstrations.layout.controlled
         values, measured = demonstrations.pad()
         flat, there = values.flatten(0, 1).float(), measured.flatten(0, 1)
@@ -67,9 +68,9 @@ class MixtureNetwork:
             torch.manual_seed(seed)
             network = _Network(inputs.shape[-1], future.shape[-1])
             optimiser = torch.optim.AdamW(network.parameters(), lr=3e-3, weight_decay=1e-3)
-            schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, EPOCHS)
+            schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, epochs)
             best, best_loss, waited = copy.deepcopy(network), float("inf"), 0
-            for epoch in range(1, EPOCHS + 1):
+            for epoch in range(1, epochs + 1):
                 network.train()
                 shown = inputs[training]
                 shown = shown + 0.02 * torch.randn(shown.shape, generator=generator)

@@ -86,14 +86,14 @@ def test_networks_look_at_what_is_shown_only_and_a_seed_reproduces() -> None:
     y, measured = tests.pad()
     spoiled = y.clone()
     spoiled[..., 3:] = 99.0
-    network = MixtureNetwork(known, 5, seed=1)
-    assert torch.equal(network(y), MixtureNetwork(known, 5, seed=1)(y))
+    network = MixtureNetwork(known, 5, seed=1, epochs=20)
+    assert torch.equal(network(y), MixtureNetwork(known, 5, seed=1, epochs=20)(y))
     assert torch.equal(network(y), network(spoiled))
     future = network(y)[:, 20]
     spoiled[:, 21:] = -5.0
     assert torch.equal(network(spoiled)[:, 20], future)
     inputs = ~known.layout.controlled
-    classifier = RecurrentClassifier(known, inputs, seed=1)
+    classifier = RecurrentClassifier(known, inputs, seed=1, rounds=40)
     keep = torch.tensor([[20, 50]] * 3)
     said = classifier(y, measured & inputs, keep)
     assert torch.equal(said[:, 0], classifier(spoiled, measured & inputs, keep)[:, 0])

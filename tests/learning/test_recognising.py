@@ -22,7 +22,7 @@ SHARES = (0.2, 0.4, 0.6, 0.8, 1.0)
 
 @pytest.fixture(scope="module")
 def model():
-    return learn(actions(120, 7), steps=60, seed=0)
+    return learn(actions(100, 7), steps=30, seed=0, scan=24)
 
 
 def test_what_was_seen_first_is_remembered(model) -> None:
