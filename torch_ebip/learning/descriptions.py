@@ -132,7 +132,7 @@ def describe_filter(filter: InteractionFilter, primitive: InteractionPrimitive) 
         "inflation": "learned" if learned else float(inflation.factor) if isinstance(inflation, Inflation) else None,  # type: ignore[arg-type]
         "phase": _describe_phase(filter.phase_model),
         "readout": _describe_readout(filter.readout),
-        "recognition": 0 if filter.recognition is None else len(filter.recognition.sharpness),
+        "recognition": filter.recognition is not None and len(filter.recognition.sharpness) > 0,
     }
     again = build_filter(primitive, description)
     ours, theirs = ({name: type(m).__name__ for name, m in each.named_modules()} for each in (filter, again))
@@ -165,9 +165,13 @@ def build_filter(primitive: InteractionPrimitive, description: Description) -> I
         options["weight_noise"] = 1.0 if options["weight_noise"] else None
         options["phase"] = _phase_of(options["phase"])
         filter = ebip(primitive, **options)
-        memories = description.get("recognition", 0)
-        if memories and primitive.labels is not None:
-            ones = primitive.weights.new_ones(memories, len(PHASES))
+        weighting = filter.analysis.weighting
+        if (
+            description.get("recognition")
+            and isinstance(weighting, EvidenceWeighting)
+            and primitive.labels is not None
+        ):
+            ones = primitive.weights.new_ones(len(weighting.forgetting.start), len(PHASES))
             filter.recognition = Recognition(primitive.labels, ones).to(primitive.weights)
         filter.readout = None if readout is None else _readout_of(readout, primitive)
         return filter
