@@ -8,13 +8,14 @@ from pathlib import Path
 
 from experiments.evaluate import Task
 from torch_ebip import Demonstrations, Layout, RobotArm
+from torch_ebip.learning import horizons
 from torch_ebip.learning.objective import joints_of
 from torch_ebip.learning.settings import settings_for
 
 FRACTIONS = (0.43, 0.82)
 """Shares of an interaction that the paper shows: before the ball is thrown, and on its way."""
 
-AHEAD = (0.1, 0.25, 0.5, 1.0)
+AHEAD = horizons.AHEAD[:-1]
 """Seconds after the last sample that is shown: what a partner needs is what comes next."""
 
 

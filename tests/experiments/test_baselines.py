@@ -44,7 +44,7 @@ def test_they_learn(methods: dict[str, Method]) -> None:
         mean = np.nanmean(values[cell]["mean"])
         assert np.nanmean(values[cell]["ridge"]) < 0.25 * mean
         assert np.nanmean(values[cell]["trees"]) < 0.5 * mean
-        assert np.nanmean(values[cell]["gru"]) < 0.6 * mean
+        assert np.nanmean(values[cell]["gru"]) < (0.5 if cell.ahead is None else 0.6) * mean
     covered = next(values[cell]["gru"].mean() for cell in values if cell.metric == "coverage_95")
     assert 0.8 < covered <= 1
 

@@ -22,7 +22,7 @@ from torch_ebip.interaction.attribution import affine_coefficients
 from torch_ebip.interaction.forecast import Forecast, Phases, as_phases, as_seconds_ahead
 from torch_ebip.interaction.phases.phase import PhaseModel
 from torch_ebip.interaction.projection import BasisProjection
-from torch_ebip.interaction.readout import Readout, lead_of
+from torch_ebip.interaction.readout import Lead, Readout, lead_of
 from torch_ebip.interaction.recognition import Recognition
 from torch_ebip.interaction.trace import InteractionTrace
 
@@ -120,8 +120,7 @@ class InteractionFilter(Filter):
             forecast = self._forecast(state, self._phases_ahead(state, phase))
         if self.readout is None:
             return forecast
-        moving = self.moving(state)
-        lead = lead_of(moving[..., 0], self.phase_model.velocity(moving), forecast.phase)
+        lead = self.lead(state, forecast.phase)
         return self.readout(forecast, lead, *self.demonstrated(lead.phase))
 
     @abstractmethod
@@ -131,6 +130,11 @@ class InteractionFilter(Filter):
     @abstractmethod
     def _forecast_ahead(self, state: State, ahead: Tensor) -> Forecast:
         """What a state implies so many seconds ahead, [P]; infinity is the end."""
+
+    def lead(self, state: State, phase: Tensor) -> Lead:
+        """How far ahead of a state phases [..., P] lie."""
+        moving = self.moving(state)
+        return lead_of(moving[..., 0], self.phase_model.velocity(moving), phase)
 
     def demonstrated(self, phase: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of the demonstrations at phases [..., P]: [..., P, D], units of the DoFs and squared."""

@@ -10,37 +10,20 @@ how far demonstrations lie apart (James & Stein 1961; Breiman's stacking, 1996).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from torch_ebip.common.ambient import owned
 from torch_ebip.common.arguments import as_values
-from torch_ebip.common.brief import brief
 from torch_ebip.filtering.protocols import View
 from torch_ebip.interaction.forecast import Forecast
-from torch_ebip.interaction.readout import Lead, hats
+from torch_ebip.interaction.readout import Lead, Widths, hats, moved, widths_of
 
 SECONDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 """Horizons for which shares are learned; far ones are of the end alone."""
 LEVELS = (0.25, 0.6, 1.0)
 """Widths of the filter's belief, as shares of the demonstrations' deviation, for which they are learned."""
-
-
-class Widths(NamedTuple):
-    """Deviations behind a forecast, units of the DoFs.
-
-    Attributes:
-        own: [..., P, D], of the filter.
-        demonstrated: [..., P, D], over the demonstrations.
-    """
-
-    own: Tensor
-    demonstrated: Tensor
-
-    def __repr__(self) -> str:
-        return brief(self)
 
 
 class HorizonShrinkage(nn.Module):
@@ -134,12 +117,6 @@ class HorizonShrinkage(nn.Module):
         return ""
 
 
-def widths_of(forecast: Forecast, variance: Tensor) -> Widths:
-    """Deviations of a forecast and of the demonstrations, whose ``variance`` is [..., P, D] in squared units."""
-    least = torch.finfo(variance.dtype).tiny
-    return Widths(forecast.variance.clamp(min=least).sqrt(), variance.clamp(min=0).sqrt())
-
-
 def horizon_hats(lead: Lead, seconds: Tensor) -> Tensor:
     """Weights [..., P, K] of the shares at ``seconds`` [K], s, for a lead; they sum to 1."""
     return hats(lead.seconds.clamp(seconds[0], seconds[-1]), seconds)
@@ -150,14 +127,3 @@ def level_hats(widths: Widths, levels: Tensor) -> Tensor:
     apart = widths.demonstrated > 0
     ratio = torch.where(apart, widths.own / torch.where(apart, widths.demonstrated, 1), levels[-1])
     return hats(ratio.clamp(levels[0], levels[-1]), levels)
-
-
-def moved(forecast: Forecast, mean: Tensor, deviation: Tensor, share: Tensor, widths: Widths) -> Forecast:
-    """A forecast with another mean and deviation [..., P, D], units of the DoFs; its members go with them."""
-    members = forecast.members
-    if members is not None:
-        # Where all members say the same there is nothing to stretch.
-        spread = widths.own > 1e-6 * widths.demonstrated
-        factor = torch.where(spread, deviation / widths.own, share).unsqueeze(-2)
-        members = mean.unsqueeze(-2) + (members - forecast.mean.unsqueeze(-2)) * factor
-    return forecast._replace(mean=mean, variance=deviation.square(), members=members)

@@ -1,4 +1,4 @@
-"""What a forecast passes through before it is said: the protocol, and what it is told of the forecast."""
+"""What a forecast passes through before it is said: the protocol, what it is told, how it moves one."""
 
 from __future__ import annotations
 
@@ -24,6 +24,21 @@ class Lead(NamedTuple):
     ahead: Tensor
     seconds: Tensor
     phase: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self)
+
+
+class Widths(NamedTuple):
+    """Deviations behind a forecast, units of the DoFs.
+
+    Attributes:
+        own: [..., P, D], of the filter.
+        demonstrated: [..., P, D], over the demonstrations.
+    """
+
+    own: Tensor
+    demonstrated: Tensor
 
     def __repr__(self) -> str:
         return brief(self)
@@ -55,3 +70,20 @@ def hats(lead: Tensor, leads: Tensor) -> Tensor:
     part = ((lead - leads[left]) / (leads[right] - leads[left])).unsqueeze(-1)
     one = torch.nn.functional.one_hot
     return one(left, len(leads)) * (1 - part) + one(right, len(leads)) * part
+
+
+def widths_of(forecast: Forecast, variance: Tensor) -> Widths:
+    """Deviations of a forecast and of the demonstrations, whose ``variance`` is [..., P, D] in squared units."""
+    least = torch.finfo(variance.dtype).tiny
+    return Widths(forecast.variance.clamp(min=least).sqrt(), variance.clamp(min=0).sqrt())
+
+
+def moved(forecast: Forecast, mean: Tensor, deviation: Tensor, share: Tensor, widths: Widths) -> Forecast:
+    """A forecast with another mean and deviation [..., P, D], units of the DoFs; its members go with them."""
+    members = forecast.members
+    if members is not None:
+        # Where all members say the same there is nothing to stretch.
+        spread = widths.own > 1e-6 * widths.demonstrated
+        factor = torch.where(spread, deviation / widths.own, share).unsqueeze(-2)
+        members = mean.unsqueeze(-2) + (members - forecast.mean.unsqueeze(-2)) * factor
+    return forecast._replace(mean=mean, variance=deviation.square(), members=members)

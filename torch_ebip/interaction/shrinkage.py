@@ -17,7 +17,7 @@ from torch_ebip.common.ambient import owned
 from torch_ebip.common.arguments import as_values
 from torch_ebip.filtering.protocols import View
 from torch_ebip.interaction.forecast import Forecast
-from torch_ebip.interaction.readout import Lead
+from torch_ebip.interaction.readout import Lead, moved, widths_of
 
 LEADS = (0.0, 0.125, 0.25, 0.5, 1.0)
 """How far ahead a share is learned for, in phase: nothing, and from an eighth of the interaction to all of it."""
@@ -81,15 +81,9 @@ class Shrinkage(nn.Module):
         """
         share = self.at(lead.ahead)
         drawn = mean + share * (forecast.mean - mean)
-        own = forecast.variance.clamp(min=torch.finfo(mean.dtype).tiny).sqrt()
-        deviation = (1 - share) * variance.clamp(min=0).sqrt() + share * own
-        members = forecast.members
-        if members is not None:
-            # Where all members say the same there is nothing to stretch.
-            spread = forecast.variance > 1e-12 * variance
-            factor = torch.where(spread, deviation / own, share).unsqueeze(-2)
-            members = drawn.unsqueeze(-2) + (members - forecast.mean.unsqueeze(-2)) * factor
-        return forecast._replace(mean=drawn, variance=deviation.square(), members=members)
+        widths = widths_of(forecast, variance)
+        deviation = (1 - share) * widths.demonstrated + share * widths.own
+        return moved(forecast, drawn, deviation, share, widths)
 
     def select(self, view: View) -> Shrinkage:
         """The same for a view of the model: of its DoFs."""

@@ -15,8 +15,8 @@ from torch import Tensor
 from torch_ebip.common.ambient import without_autocast
 from torch_ebip.common.brief import brief
 from torch_ebip.interaction.filters import InteractionFilter
-from torch_ebip.interaction.horizons import LEVELS, SECONDS, HorizonShrinkage, horizon_hats, level_hats, widths_of
-from torch_ebip.interaction.readout import lead_of
+from torch_ebip.interaction.horizons import LEVELS, SECONDS, HorizonShrinkage, horizon_hats, level_hats
+from torch_ebip.interaction.readout import widths_of
 from torch_ebip.learning.held_out import HeldOut
 from torch_ebip.learning.metrics import Z95
 from torch_ebip.learning.stages import Scores, scores_of, tally
@@ -130,9 +130,7 @@ def _said(held_out: HeldOut, filter: InteractionFilter, interactions: Tensor) ->
         for trial in held_out.trials(filter, interactions, subset):
             shown, state = trial.shown, trial.trace.kept
             forecast = trial.forecast(objective)
-            moving = trial.filter.moving(state)
-            velocity = trial.filter.phase_model.velocity(moving)
-            lead = lead_of(moving[..., 0], velocity, forecast.phase)
+            lead = trial.filter.lead(state, forecast.phase)
             weights = primitive.weights[shown.members].mean(1)[:, None, None, :]
             mean = primitive.basis.project(lead.phase, weights)[..., targets]
             _, variance = trial.filter.demonstrated(lead.phase)
