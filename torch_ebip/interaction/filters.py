@@ -132,7 +132,7 @@ class InteractionFilter(Filter):
         """What a state implies so many seconds ahead, [P]; infinity is the end."""
 
     def lead(self, state: State, phase: Tensor) -> Lead:
-        """How far ahead of a state phases [..., P] lie."""
+        """How far ahead of a ``state`` each ``phase`` [..., P] lies."""
         moving = self.moving(state)
         return lead_of(moving[..., 0], self.phase_model.velocity(moving), phase)
 
