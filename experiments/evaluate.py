@@ -14,7 +14,6 @@ from torch import Tensor
 from experiments.results import Cell, Values
 from torch_ebip import (
     Demonstrations,
-    DemonstrationTable,
     Forecast,
     InteractionFilter,
     InteractionPrimitive,
@@ -23,7 +22,7 @@ from torch_ebip import (
 )
 from torch_ebip.common.draws import seeded
 from torch_ebip.learning import metrics as measure
-from torch_ebip.learning.references import ends, last_measured, nearest, recorded
+from torch_ebip.learning.references import last_measured, nearest, paths_after, recorded
 
 
 class Task(NamedTuple):
@@ -122,17 +121,14 @@ class MeanMethod:
 
     def __init__(self, primitive: InteractionPrimitive) -> None:
         self.primitive = copy.deepcopy(primitive).cpu()
-        self.table, self.ends = DemonstrationTable.of(self.primitive), ends(self.primitive)
 
     def __call__(
         self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor, ahead: Sequence[float] = END
     ) -> Answer:
         """See `Method`."""
-        time = keep.unsqueeze(-1) / self.primitive.rate + y.new_tensor(ahead).to(self.ends)  # [B, K, A]
-        every = torch.arange(len(self.ends)).expand(*time.shape, -1)
-        phase = (time.unsqueeze(-1) * self.primitive.phase_velocity).clamp(max=1)
-        members = self.table.at(every, phase.unsqueeze(-1), dofs.nonzero().squeeze(-1)).squeeze(-2)
-        members = torch.where(time.isinf()[..., None, None], self.ends[:, dofs], members).to(y)
+        time = keep.unsqueeze(-1) / self.primitive.rate + torch.tensor(ahead)  # [B, K, A]
+        every = torch.arange(len(self.primitive)).expand(*time.shape, -1)
+        members = paths_after(self.primitive, time.unsqueeze(-1), every, dofs).to(y)
         forecast = Forecast(members.mean(-2), members.var(-2), y.new_ones(time.shape), members)
         return Answer(forecast, y.new_full(keep.shape, torch.nan))
 
@@ -152,13 +148,10 @@ class NearestMethod:
         """See `Method`."""
         primitive = self.primitive
         chosen = nearest(primitive, y, observed, keep, 1 / primitive.rate)
-        velocity = primitive.phase_velocity[chosen]
-        at = keep / primitive.rate * velocity
-        phase = (at.unsqueeze(-1) + y.new_tensor(ahead).to(velocity) * velocity.unsqueeze(-1)).clamp(max=1)
-        used = primitive.basis.dof_of_weight()
-        weights = primitive.weights[:, dofs[used]]
-        mean = primitive.basis.select(dofs).project(phase, weights[chosen].unsqueeze(-2)).to(y)
-        return Answer(Forecast(mean, torch.full_like(mean, torch.nan), phase.to(y)), at.to(y))
+        time = keep.unsqueeze(-1) / primitive.rate + torch.tensor(ahead)  # [B, K, A]
+        mean = paths_after(primitive, time, chosen.unsqueeze(-1).expand(time.shape), dofs).to(y)
+        at = (keep / primitive.rate * primitive.phase_velocity[chosen]).to(y)
+        return Answer(Forecast(mean, torch.full_like(mean, torch.nan), torch.full_like(mean[..., 0], torch.nan)), at)
 
 
 def evaluate(

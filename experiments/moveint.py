@@ -18,15 +18,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from experiments.baselines.mixture import EPOCHS, MixtureNetwork
+from experiments.baselines.mixture import EPOCHS, MixtureNetwork, next_samples
+from experiments.evaluate import FilterMethod, MeanMethod, Method, NearestMethod
 from experiments.folds import mean_of_cells, read_values, run_folds, share_cores, write_values
 from experiments.results import Cell, Values, print_tables, summarise
 from experiments.run_folder import RunFolder
 from torch_ebip import Demonstrations, InteractionModel, InteractionPrimitive, learn
-from torch_ebip.common.draws import seeded
-from torch_ebip.filtering.states import map_state
-from torch_ebip.interaction import DemonstrationTable, InteractionFilter
-from torch_ebip.learning.references import nearest
 from torch_ebip.learning.starts import scaled
 
 AHEAD = 5
@@ -76,75 +73,47 @@ def run_seed(job: Job) -> Values:
     model: InteractionModel | None = None
     if {"ebip_scaled", "ebip_tuned"} & set(job.methods):
         model = learn(known, steps=job.steps, seed=job.seed, progress=lambda _: None)
+    primitive = model.primitive if model is not None else InteractionPrimitive.fit(known)
     values: Values = {}
     for name in job.methods:
         if name == "mixture_gru":
-            y, _ = tests.pad()
-            said = MixtureNetwork(known, AHEAD, job.seed, job.epochs)(y)
+            said = MixtureNetwork(known, AHEAD, job.seed, job.epochs)(tests.pad()[0])
         elif name in ("mean", "nearest"):
-            said = _reference(name, known, tests)
+            method: Method = MeanMethod(primitive) if name == "mean" else NearestMethod(primitive)
+            said = answered(lambda _, method=method: method, tests)
         else:
             assert model is not None
-            filter = model.filter if name == "ebip_tuned" else scaled(model.primitive, model.report["factor"])
-            said = filtered(filter, tests, job.seed)
+            filter = model.filter if name == "ebip_tuned" else scaled(primitive, model.report["factor"])
+            said = answered(lambda number, filter=filter: FilterMethod(filter, job.seed, [number]), tests)
         for cell, array in by_action(said, tests).items():
             values.setdefault(cell, {})[name] = array
     write_values(finished, values)
     return values
 
 
-@torch.no_grad()
-def filtered(filter: InteractionFilter, tests: Demonstrations, seed: int) -> Tensor:
-    """[B, T, AHEAD, M]: what a filter expects of the next samples, after each one."""
+def answered(method_of: Callable[[int], Method], tests: Demonstrations) -> Tensor:
+    """[B, T, AHEAD, M]: what a method expects of the next samples, after each one.
+
+    Args:
+        method_of: the method for a test by its number: one at a time, all moments of all would fill the memory.
+        tests: B interactions.
+    """
     y, measured = tests.pad()
     targets = tests.layout.controlled
-    observed = measured & ~targets
-    every = torch.arange(y.shape[1]).expand(len(y), -1)
-    draws = [seeded(seed, number) for number in range(len(y))]
-    trace = filter(torch.where(observed, y, torch.nan), observed, generator=draws, keep=every, project=False)
-    ahead = torch.arange(1, AHEAD + 1) / tests.rate
-    return torch.cat(
-        [filter.forecast(part, ahead=ahead).mean[..., targets].unsqueeze(0) for part in _entries(trace.kept, len(y))]
-    )
-
-
-def _entries(state: object, count: int) -> list[object]:
-    """The entries of a batch of states one by one: all horizons of all of them would fill the memory."""
-
-    def entry(b: int) -> Callable[[Tensor], Tensor]:
-        return lambda part: part[b]
-
-    return [map_state(entry(b), state) for b in range(count)]
-
-
-def _reference(name: str, known: Demonstrations, tests: Demonstrations) -> Tensor:
-    """[B, T, AHEAD, M]: the mean of all at the time that will have passed, or the one that was nearest so far."""
-    primitive = InteractionPrimitive.fit(known)
-    table, targets = DemonstrationTable.of(primitive), tests.layout.controlled.nonzero().squeeze(-1)
-    y, measured = tests.pad()
-    every = torch.arange(y.shape[1]).expand(len(y), -1)
-    time = (every.unsqueeze(-1) + torch.arange(1, AHEAD + 1)) / primitive.rate
-    if name == "mean":
-        all_of_them = torch.arange(len(known)).expand(y.shape[1], AHEAD, -1)
-        phase = (time[0].unsqueeze(-1) * primitive.phase_velocity).clamp(max=1)
-        said = table.at(all_of_them, phase.unsqueeze(-1), targets).squeeze(-2).mean(-2)
-        return said.expand(len(y), -1, -1, -1)
-    chosen = nearest(primitive, y, measured & ~tests.layout.controlled, every, 1 / primitive.rate)
-    one = chosen.unsqueeze(-1).expand(time.shape)
-    phase = (time * primitive.phase_velocity[one]).clamp(max=1)
-    return table.at(one, phase.unsqueeze(-1), targets).squeeze(-2)
+    every = torch.arange(y.shape[1]).unsqueeze(0)
+    ahead = [k / tests.rate for k in range(1, AHEAD + 1)]
+    parts = []
+    for b in range(len(y)):
+        one = slice(b, b + 1)
+        parts.append(method_of(b)(y[one], measured[one] & ~targets, every, targets, ahead).forecast.mean)
+    return torch.cat(parts)
 
 
 def by_action(said: Tensor, tests: Demonstrations) -> dict[Cell, NDArray[np.float64]]:
     """Values by action, one a test interaction; of forecasts [B, T, AHEAD, M]."""
-    y, _ = tests.pad()
-    lengths, targets = tests.lengths, tests.layout.controlled
-    length = y.shape[1]
-    steps = torch.arange(length).unsqueeze(-1) + torch.arange(1, AHEAD + 1)
-    truth = y[:, steps.clamp(max=length - 1)][..., targets]
-    counted = (steps < lengths.view(-1, 1, 1)).to(y)
-    joints = truth.shape[-1] / 3
-    squares = (said - truth).square().nan_to_num().sum(-1) / joints
+    truth = next_samples(tests, AHEAD)
+    counted = ~truth.isnan().any(-1)
+    squares = (said - truth).square().nan_to_num().sum(-1) / (truth.shape[-1] / 3)
     each = 100 * (squares * counted).sum((1, 2)) / counted.sum((1, 2))
     actions = tests.columns["action"]
     return {

@@ -27,7 +27,7 @@ from experiments.results import Cell, Values, print_tables, summarise
 from experiments.run_folder import RunFolder, save_figure
 from torch_ebip import Demonstrations, learn
 from torch_ebip.common.draws import seeded
-from torch_ebip.learning.recognising import calibration_error
+from torch_ebip.learning.recognising import calibration_error, reliability
 from torch_ebip.learning.references import nearest
 from torch_ebip.recordings import actions
 
@@ -137,19 +137,10 @@ def calibration(values: Values, method: str) -> dict[str, Any]:
         torch.tensor(np.stack([values[Cell("all", s, metric, None, "1")][method] for s in SHARES], -1))
         for metric in ("confidence", "accuracy")
     )
-    bins = []
-    for low in np.arange(10) / 10:
-        mine = (sure >= low) & (sure < low + 0.1 + (1e-9 if low > 0.85 else 0))
-        if bool(mine.any()):
-            bins.append(
-                {"confidence": float(sure[mine].mean()), "accuracy": float(right[mine].mean()), "n": int(mine.sum())}
-            )
     return {
-        "expected_calibration_error": calibration_error(sure.flatten().unsqueeze(-1), right.flatten().bool()),
-        "by_share": {
-            str(s): calibration_error(sure[:, k].unsqueeze(-1), right[:, k].bool()) for k, s in enumerate(SHARES)
-        },
-        "reliability": bins,
+        "expected_calibration_error": calibration_error(sure.flatten(), right.flatten().bool()),
+        "by_share": {str(s): calibration_error(sure[:, k], right[:, k].bool()) for k, s in enumerate(SHARES)},
+        "reliability": [b._asdict() for b in reliability(sure.flatten(), right.flatten().bool())],
     }
 
 

@@ -39,6 +39,18 @@ def point_answer(mean: Tensor) -> Answer:
     )
 
 
+def places_of(ahead: Sequence[float], learned: Sequence[float]) -> list[int]:
+    """Where the seconds that are asked for are among those that were learned.
+
+    Raises:
+        ValueError: some were not.
+    """
+    strange = [a for a in ahead if a not in learned]
+    if strange:
+        raise ValueError(f"{strange} s ahead were not learned, only {list(learned)}")
+    return [learned.index(a) for a in ahead]
+
+
 def futures(demonstrations: Demonstrations, keep: Tensor, ahead: Sequence[float], targets: Tensor) -> Tensor:
     """[N, K, A, M], units of the DoFs: what is to be forecast, with the same rule as in `evaluate`.
 

@@ -13,6 +13,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from experiments.baselines.common import futures
 from experiments.baselines.stretches import moments
 from torch_ebip import Demonstrations
 
@@ -58,7 +59,8 @@ class MixtureNetwork:
         flat, there = values.flatten(0, 1).float(), measured.flatten(0, 1)
         self._center, self._scale = moments(flat, there)
         standard = ((values.float() - self._center) / self._scale).nan_to_num()
-        future, counted = futures_of(standard[..., self.targets], demonstrations.lengths, ahead)
+        later = (next_samples(demonstrations, ahead).float() - self._center[self.targets]) / self._scale[self.targets]
+        future, counted = later.nan_to_num().flatten(-2), ~later.isnan().any(-1).any(-1)
         inputs = standard[..., ~self.targets]
         generator = torch.Generator().manual_seed(seed)
         order = torch.randperm(len(values), generator=generator)
@@ -100,12 +102,12 @@ class MixtureNetwork:
         return (expected * self._scale[self.targets] + self._center[self.targets]).to(y)
 
 
-def futures_of(values: Tensor, lengths: Tensor, ahead: int) -> tuple[Tensor, Tensor]:
-    """The next samples of values [B, T, M], [B, T, ahead * M], and where all of them are there, bool [B, T]."""
-    length = values.shape[1]
-    steps = torch.arange(length).unsqueeze(-1) + torch.arange(1, ahead + 1)
-    future = values[:, steps.clamp(max=length - 1)].flatten(-2)
-    return future, steps[:, -1] < lengths.unsqueeze(-1)
+def next_samples(demonstrations: Demonstrations, count: int) -> Tensor:
+    """[N, T, count, M], units of the DoFs: the controlled DoFs after each sample; NaN behind the end."""
+    longest = int(demonstrations.lengths.max())
+    every = torch.arange(longest).expand(len(demonstrations), -1)
+    ahead = [k / demonstrations.rate for k in range(1, count + 1)]
+    return futures(demonstrations, every, ahead, demonstrations.layout.controlled)
 
 
 def _loss(said: tuple[Tensor, Tensor, Tensor], future: Tensor, counted: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from experiments.baselines.common import futures, until
+from experiments.baselines.common import futures, places_of, until
 from experiments.baselines.network import Data, RecurrentSettings, Trained, train
 from experiments.baselines.stretches import all_features, cumulative, features_of, moments
 from experiments.evaluate import END, Answer
@@ -83,9 +83,7 @@ class RecurrentMethod:
         Raises:
             ValueError: DoFs are asked for that are no targets, or seconds that were not learned.
         """
-        strange = [a for a in ahead if a not in self.ahead]
-        if strange:
-            raise ValueError(f"{strange} s ahead were not learned, only {list(self.ahead)}")
+        asked = places_of(ahead, self.ahead)
         if (dofs & ~self.targets).any():
             raise ValueError("DoFs are asked for that were not among the targets")
         values = (y[..., self.inputs].float() - self._center) / self._scale
@@ -95,7 +93,7 @@ class RecurrentMethod:
             for k in range(keep.shape[1])
         ]
         means, variances = zip(*forecasts, strict=True)
-        wanted, asked = dofs[self.targets], [self.ahead.index(a) for a in ahead]
+        wanted = dofs[self.targets]
         shape = (*keep.shape, len(self.ahead), -1)
         mean, variance = (
             torch.stack(part, 1).view(shape)[..., asked, :][..., wanted].to(y) for part in (means, variances)

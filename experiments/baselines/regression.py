@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from experiments.baselines.common import Array, futures, kept_steps, point_answer, until
+from experiments.baselines.common import Array, futures, kept_steps, places_of, point_answer, until
 from experiments.evaluate import END, Answer
 from torch_ebip import Demonstrations
 
@@ -60,16 +60,14 @@ class _RegressionMethod(ABC):
             raise ValueError(f"keep has {keep.shape[1]} columns for the {len(self.fractions)} fractions")
         if (dofs & ~self.targets).any():
             raise ValueError("DoFs are asked for that were not among the targets")
-        strange = [a for a in ahead if a not in self.ahead]
-        if strange:
-            raise ValueError(f"{strange} s ahead were not learned, only {list(self.ahead)}")
+        asked = places_of(ahead, self.ahead)
         shown = observed.any(0).any(0)
         means = []
         for k, fraction in enumerate(self.fractions):
             regression = self.fit(shown, fraction)
             features = self._features(y[..., shown], until(observed, keep[:, k])[..., shown], keep[:, k])
             said = torch.from_numpy(regression.predict(features)).to(y).view(len(y), len(self.ahead), -1)
-            means.append(said[:, [self.ahead.index(a) for a in ahead]])
+            means.append(said[:, asked])
         return point_answer(torch.stack(means, 1)[..., dofs[self.targets]])
 
     def fit(self, shown: Tensor, fraction: float) -> _Regression:

@@ -9,7 +9,7 @@ import torch
 
 from experiments import compare, moveint, recognise
 from experiments.baselines.classifier import RecurrentClassifier, probabilities_of
-from experiments.baselines.mixture import MixtureNetwork, futures_of
+from experiments.baselines.mixture import MixtureNetwork, next_samples
 from torch_ebip import Demonstrations
 from torch_ebip.recordings import actions
 
@@ -100,6 +100,14 @@ def test_networks_look_at_what_is_shown_only_and_a_seed_reproduces() -> None:
     assert torch.allclose(said.sum(-1), torch.ones(3, 2))
     other = probabilities_of(said, classifier.labels, ("nod", "never", "lift"))
     assert torch.equal(other[..., 1], torch.zeros(3, 2))
-    future, there = futures_of(torch.arange(6.0).view(1, 6, 1), torch.tensor([5]), 2)
-    assert there.tolist() == [[True, True, True, False, False, False]]
-    assert future[0, 1].tolist() == [2.0, 3.0]
+
+
+def test_the_next_samples_are_those_that_were_recorded() -> None:
+    made = actions(2, 1)
+    future = next_samples(made, 3)
+    for b, path in enumerate(made):
+        for t in (0, 20, len(path) - 3, len(path) - 1):
+            for k in range(3):
+                there = t + 1 + k < len(path)
+                wanted = path[t + 1 + k, 3:] if there else torch.full((3,), torch.nan)
+                torch.testing.assert_close(future[b, t, k], wanted, equal_nan=True)

@@ -49,6 +49,21 @@ def test_what_is_recorded_is_found_between_samples_and_nowhere_else() -> None:
         assert float(found[k, -1]) == 64.0
 
 
+@pytest.mark.parametrize("rate", [24.0, 29.97, 30.0, 60.0, 120.0, 1000.0])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_horizon_that_is_so_many_samples_finds_them_up_to_the_last(rate: float, dtype: torch.dtype) -> None:
+    """Whatever k / rate is rounded to."""
+    values = torch.arange(400, dtype=dtype).view(1, 400, 1)
+    every, ahead = (
+        torch.arange(400).unsqueeze(0),
+        torch.tensor([k / rate for k in (1, 2, 3, 5, 7, 60, 100, 300)], dtype=dtype),
+    )
+    found = recorded(values, torch.tensor([400]), values[:, -1], every, ahead, rate)[0, :, :, 0]
+    for p, k in enumerate((1, 2, 3, 5, 7, 60, 100, 300)):
+        assert torch.equal(found[: 400 - k, p], values[0, k:, 0]), k
+        assert bool(found[400 - k :, p].isnan().all()), k
+
+
 def test_terms_are_means_over_what_was_measured_every_horizon_alike() -> None:
     known = gappy()
     held = held_out(known)

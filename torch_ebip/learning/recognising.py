@@ -89,27 +89,53 @@ def learn_recognition(
         "labels": {label: labels.count(label) for label in plain.labels},
         "accuracy": round(float(right.double().mean()), 4),
         "accuracy_by_share": {str(s): round(float(right[:, k].double().mean()), 4) for k, s in enumerate(SHARES)},
-        "expected_calibration_error": round(calibration_error(said.flatten(0, 1), right.flatten()), 4),
+        "expected_calibration_error": round(calibration_error(said.amax(-1).flatten(), right.flatten()), 4),
         "log_loss": round(float(-chance.log().mean()), 4),
     }
     return recognition, report
 
 
-def calibration_error(probability: Tensor, right: Tensor, bins: int = 10) -> float:
-    """Expected calibration error (Naeini et al. 2015) of the most probable label.
+class Bin(NamedTuple):
+    """Answers of about one confidence.
+
+    Attributes:
+        confidence: mean probability of the most probable label.
+        accuracy: share of them for which it was the right one.
+        n: how many.
+    """
+
+    confidence: float
+    accuracy: float
+    n: int
+
+
+def reliability(confidence: Tensor, right: Tensor, bins: int = 10) -> list[Bin]:
+    """How often the sure are right: the bins that have answers.
 
     Args:
-        probability: [R, L], of the labels.
-        right: bool [R], whether the most probable one was it.
+        confidence: [R], probability of the most probable label.
+        right: bool [R], whether it was it.
         bins: even ones between 0 and 1.
     """
-    sure = probability.amax(-1).double()
-    place = (sure * bins).floor().clamp(max=bins - 1).long()
-    error = 0.0
+    sure = confidence.double()
+    place = (sure * bins).floor().clamp(max=bins - 1)
+    found = []
     for b in sorted(set(place.tolist())):
         mine = place == b
-        error += float((right[mine].double().mean() - sure[mine].mean()).abs() * mine.double().mean())
-    return error
+        found.append(Bin(float(sure[mine].mean()), float(right[mine].double().mean()), int(mine.sum())))
+    return found
+
+
+def calibration_error(confidence: Tensor, right: Tensor, bins: int = 10) -> float:
+    """Expected calibration error (Naeini et al. 2015): the mean distance of the bins of `reliability` from the line.
+
+    Args:
+        confidence: [R], probability of the most probable label.
+        right: bool [R], whether it was it.
+        bins: even ones between 0 and 1.
+    """
+    found = reliability(confidence, right, bins)
+    return sum(abs(b.accuracy - b.confidence) * b.n for b in found) / len(right)
 
 
 @without_autocast

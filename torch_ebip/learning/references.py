@@ -7,11 +7,28 @@ from torch import Tensor
 
 from torch_ebip.interaction.primitive import InteractionPrimitive
 
+SLACK = 1e-4
+"""Of a sample: so far from one a time may be rounded and still be its."""
+
 
 def ends(primitive: InteractionPrimitive) -> Tensor:
     """[N, D]: where the demonstrations of a primitive end, units of the DoFs."""
     one = primitive.weights.new_ones(len(primitive))
     return primitive.basis.project(one, primitive.weights)
+
+
+def paths_after(primitive: InteractionPrimitive, time: Tensor, which: Tensor, dofs: Tensor) -> Tensor:
+    """[..., D_dofs], units of the DoFs: where demonstrations are so long after they began, by their own regressions.
+
+    Args:
+        primitive: of the demonstrations.
+        time: [...], s; infinity, and what lies behind the end of one, is its end.
+        which: int64 [...], which demonstrations.
+        dofs: bool [D], which DoFs.
+    """
+    used = dofs.to(primitive.weights.device)[primitive.basis.dof_of_weight().to(primitive.weights.device)]
+    phase = (time.to(primitive.phase_velocity) * primitive.phase_velocity[which]).clamp(max=1)
+    return primitive.basis.select(dofs).project(phase, primitive.weights[:, used][which])
 
 
 def last_measured(trajectory: Tensor) -> Tensor:
@@ -41,12 +58,13 @@ def recorded(values: Tensor, lengths: Tensor, ends: Tensor, now: Tensor, ahead: 
     """
     last = (lengths - 1).view(-1, 1, 1)
     at = now.unsqueeze(-1) + torch.where(ahead.isinf(), 0, ahead).double() * rate
-    before = (at + 1e-6).floor().long()
+    before = (at + SLACK).floor().long()
     part = (at - before).clamp(min=0).to(values).unsqueeze(-1)
     rows = torch.arange(len(values), device=values.device).view(-1, 1, 1)
     first, second = (values[rows, torch.minimum(step, last)] for step in (before, before + 1))
-    found = torch.where(part > 1e-6, torch.lerp(first, second, part), first)
-    found = torch.where((at <= last + 1e-6).unsqueeze(-1), found, torch.nan)
+    found = torch.where(part > SLACK, torch.lerp(first, second, part), first)
+    # In float64: float32 has no place for so little beside the last sample, which would then lie behind the end.
+    found = torch.where((at <= last.double() + SLACK).unsqueeze(-1), found, torch.nan)
     return torch.where(ahead.isinf().view(-1, 1), ends.view(len(values), 1, 1, -1), found)
 
 

@@ -7,10 +7,9 @@ from torch import Tensor
 
 from torch_ebip.common.ambient import without_autocast
 from torch_ebip.interaction.filters import InteractionFilter
-from torch_ebip.interaction.table import DemonstrationTable
 from torch_ebip.learning.held_out import HeldOut, Trial
 from torch_ebip.learning.metrics import Z95
-from torch_ebip.learning.references import nearest
+from torch_ebip.learning.references import nearest, paths_after
 
 Scores = dict[str, float]
 """``error``, the root mean squared error over all horizons alike in units of the targets' spread, ``error/HORIZON``,
@@ -45,8 +44,6 @@ def reference_scores(held_out: HeldOut, interactions: Tensor) -> tuple[Scores, S
     task, settings = held_out.task, held_out.settings
     primitive, ahead = task.primitive, task.objective.ahead
     assert ahead is not None
-    table = DemonstrationTable.of(primitive)
-    targets = task.targets.nonzero().squeeze(-1)
     dt = settings.thinning / primitive.rate
     totals: tuple[dict[str, float], dict[str, float]] = {}, {}
     count = 0
@@ -57,11 +54,9 @@ def reference_scores(held_out: HeldOut, interactions: Tensor) -> tuple[Scores, S
             y[..., shown.dofs], observed[..., shown.dofs] = shown.y, shown.observed
             time = (shown.steps * dt).to(y).unsqueeze(-1) + ahead  # [B, K, P]
             among = shown.members[:, None, None, :].expand(*time.shape, -1)
-            phase = (time.unsqueeze(-1) * primitive.phase_velocity[among]).clamp(max=1)
-            mean = table.at(among, phase.unsqueeze(-1), targets).squeeze(-2).mean(-2)
+            mean = paths_after(primitive, time.unsqueeze(-1), among, task.targets).mean(-2)
             one = nearest(primitive, y, observed, shown.steps, dt, shown.members).unsqueeze(-1).expand(time.shape)
-            phase = (time * primitive.phase_velocity[one]).clamp(max=1)
-            near = table.at(one, phase.unsqueeze(-1), targets).squeeze(-2)
+            near = paths_after(primitive, time, one, task.targets)
             for said, total in zip((mean, near), totals, strict=True):
                 for key, value in tally(held_out, said - shown.truth).items():
                     total[key] = total.get(key, 0.0) + value * len(y)
