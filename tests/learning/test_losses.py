@@ -36,7 +36,7 @@ def test_crps_is_its_definition_also_with_weights() -> None:
             for d in range(3):
                 x, y, v = members[b, :, d].numpy(), target[b, d].item(), w[b].numpy()
                 pairs = np.abs(x[:, None] - x[None]) * np.outer(v, v)
-                expected = (v * np.abs(x - y)).sum() - pairs.sum() / 2 / (1 - (v**2).sum())
+                expected = (v * np.abs(x - y)).sum() - pairs.sum() / 2 / (1 - 1 / 11)
                 assert result[b, d].item() == pytest.approx(expected, abs=1e-12)
 
 
@@ -95,6 +95,15 @@ def test_fair_scores_do_not_depend_on_the_size_of_the_ensemble() -> None:
     target = draws(4000, 2, seed=9)
     small, large = crps(draws(4000, 3, 2), target).mean(), crps(draws(4000, 60, 2), target).mean()
     assert small.item() == pytest.approx(large.item(), abs=0.02)
+
+
+def test_a_filter_wins_nothing_by_naming_the_two_members_that_lie_outermost() -> None:
+    """With the correction for given weights they would be the best forecast of all: whatever comes lies between."""
+    members, target = draws(500, 40, 1), draws(500, 1, seed=9)
+    outermost = torch.zeros(500, 40, dtype=torch.float64)
+    for most in (members.argmin(-2), members.argmax(-2)):
+        outermost.scatter_(-1, most, 0.5)
+    assert crps(members, target, outermost).mean() > 1.5 * crps(members, target).mean()
 
 
 def test_energy_score_in_one_dimension_is_the_crps() -> None:

@@ -14,7 +14,10 @@ from torch_ebip.common.ambient import without_autocast
 def crps(members: Tensor, target: Tensor, weights: Tensor | None = None, fair: bool = True) -> Tensor:
     """Continuous ranked probability score, fair for finite ensembles (Ferro 2014), in O(E log E) by sorting.
 
-    sum_j w_j |x_j - y| - sum_jk w_j w_k |x_j - x_k| / (2 (1 - sum_j w_j^2)).
+    sum_j w_j |x_j - y| - sum_jk w_j w_k |x_j - x_k| / (2 (1 - 1 / E)).
+
+    The last divisor is that of E draws also where they have weights. With 2 (1 - sum_j w_j^2), which is fair to weights
+    that do not depend on the members, a filter that chooses its weights gains by putting nearly all on one of them.
 
     Args:
         members: [..., E, D], E >= 2.
@@ -39,7 +42,7 @@ def crps(members: Tensor, target: Tensor, weights: Tensor | None = None, fair: b
     # Half of sum_jk w_j w_k |x_j - x_k| is sum_j w_j x_(j) (2 W_j - 1), W_j the weight up to the middle of j.
     spread = (sorted_shares * (2 * below - 1) * ordered).sum(-2)
     error = (shares * distances.abs()).sum(-2)
-    return error - (spread / (1 - weights.square().sum(-1, keepdim=True)) if fair else spread)
+    return error - (spread / (1 - 1 / E) if fair else spread)
 
 
 def gaussian_crps(mean: Tensor, variance: Tensor, target: Tensor) -> Tensor:
