@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.folds import interleave, merge, read_values, run_folds, write_values
+from experiments.folds import interleave, mean_of_cells, merge, read_values, run_folds, write_values
 from experiments.results import Cell
 from torch_ebip.learning.ranks import Ranks
 
@@ -58,3 +58,10 @@ def test_values_come_back_from_their_file_as_they_were(tmp_path: Path) -> None:
     assert list(read) == [CELL]
     for name, array in written[CELL].items():
         np.testing.assert_array_equal(read[CELL][name], array)
+
+
+def test_the_headline_is_of_the_end() -> None:
+    near = CELL._replace(ahead=0.1)
+    asked = {**values(1.0, 3.0), near: {"a": np.array([100.0, 100.0])}}
+    assert mean_of_cells(asked, "a", "mae") == 2.0
+    assert np.isnan(mean_of_cells(asked, "c", "mae"))
