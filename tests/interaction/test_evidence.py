@@ -6,19 +6,25 @@ import torch
 
 from torch_ebip import DemonstrationTable, EvidenceWeighting
 from torch_ebip.filtering.updates.weighting import Seen
+from torch_ebip.interaction.evidence import LEAST_SPREAD
 
 
 def draws(*shape: int, seed: int) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
+@pytest.mark.parametrize("relative", [0.0, 1.0, -0.4])
 @pytest.mark.parametrize(
     ("sharpness", "rates", "slope"),
-    [([3.0], [4.0], 1.5), ([3.0, 2.0], [4.0, 0.5], 1.5), ([0.5, 1.0, 2.0], [6.0, 1.0, 0.01], 2.0)],
+    [([3.0], [4.0], [1.5]), ([3.0, 2.0], [4.0, 0.5], [1.5, -1.0]), ([0.5, 1.0, 2.0], [6.0, 1.0, 0.01], [2.0] * 3)],
 )
-def test_weights_are_those_of_the_formula(sharpness: list[float], rates: list[float], slope: float) -> None:
+def test_weights_are_those_of_the_formula(
+    sharpness: list[float], rates: list[float], slope: list[float], relative: float
+) -> None:
     variance = torch.tensor([0.5, 2.0, 4.0], dtype=torch.float64)
-    table = DemonstrationTable(draws(7, 5, 3, seed=2), draws(7, 5, 3, seed=3))
+    values = draws(7, 5, 3, seed=2)
+    table = DemonstrationTable(values, draws(7, 5, 3, seed=3))
+    spreads = values.numpy().var(0, ddof=1) / variance.numpy()
     module = EvidenceWeighting(
         table,
         variance,
@@ -27,6 +33,7 @@ def test_weights_are_those_of_the_formula(sharpness: list[float], rates: list[fl
         forgetting=rates,
         slope=slope,
         primacy=0.7,
+        relative=relative,
         wander=0.1,
         offsets=(-0.1, 0.0, 0.2),
     )
@@ -50,8 +57,12 @@ def test_weights_are_those_of_the_formula(sharpness: list[float], rates: list[fl
         sample = Seen(value, shown, None, None, mean.expand(7, 2), mean, torch.arange(7))
         evidence = module.compare(evidence, projections[t], sample)
         if observed[t].any():
-            squares = (projections[t] - y[t]).numpy() ** 2 * factor / variance.numpy()
-            tempers = 0.5 * np.array(sharpness) * np.exp(slope * (phases[t].item() - 0.5))
+            unit = [
+                np.interp(phases[t], np.linspace(0, 1, 5), (spreads[:, d] + LEAST_SPREAD) ** -relative)
+                for d in range(3)
+            ]
+            squares = (projections[t] - y[t]).numpy() ** 2 * factor / variance.numpy() * np.array(unit)
+            tempers = 0.5 * np.array(sharpness) * np.exp(np.array(slope) * (phases[t].item() - 0.5))
             temper = tempers.sum()
             prior = np.exp([-0.5, 0.0, -2.0])
             likelihood = np.exp(-temper * squares[..., observed[t]].mean(-1)) @ (prior / prior.sum())
@@ -107,7 +118,13 @@ def test_a_gradient_reaches_every_memory() -> None:
         moving = torch.tensor([0.1 * t, 0.5]).double().expand(6, 2)
         memory = module.learn(memory, Seen(y, None, None, None, moving, moving[0], origin))
     (memory.weights * torch.arange(6)).sum().backward()
-    for parameter in (module.sharpness.raw, module.forgetting.raw, module.slope.raw, module.primacy.raw):
+    for parameter in (
+        module.sharpness.raw,
+        module.forgetting.raw,
+        module.slope.raw,
+        module.primacy.raw,
+        module.relative.raw,
+    ):
         assert parameter.grad is not None
         assert (parameter.grad != 0).all()
         assert parameter.grad.isfinite().all()
@@ -131,8 +148,30 @@ def test_what_was_seen_first_is_remembered_or_not() -> None:
     assert said["slow"] == pytest.approx(0.5, abs=0.02)
 
 
+def test_a_distance_tells_more_where_demonstrations_are_close_together() -> None:
+    """Two demonstrations that part by 0.1 early and by 10 late: half-way between the second and both, twice."""
+    values = torch.tensor([0.1, 0.1, 0.1, 10.0, 10.0])
+    table = DemonstrationTable(torch.stack([torch.zeros(5, 1), values.unsqueeze(-1)]), torch.zeros(2, 5, 1))
+    told = {}
+    for relative in (0.0, 1.0):
+        for phase, y in ((0.1, 0.075), (0.9, 7.5)):
+            module = EvidenceWeighting(
+                table, torch.tensor([20.0]), torch.tensor([0]), 4.0, slope=0.0, relative=relative, offsets=[0.0]
+            )
+            moving = torch.tensor([phase, 0.5]).expand(2, 2)
+            seen = Seen(torch.tensor([y]), None, None, None, moving, moving[0], torch.arange(2))
+            told[relative, phase] = module.learn(module.start(torch.arange(2)), seen).weights[1].item()
+    assert told[0.0, 0.1] == pytest.approx(0.5, abs=0.001)
+    assert told[1.0, 0.1] - 0.5 > 9 * (told[0.0, 0.1] - 0.5) > 0
+    assert told[0.0, 0.9] > 0.9
+
+
 def test_a_sharpness_for_each_memory_is_asked_for() -> None:
-    with pytest.raises(ValueError, match="sharpness must be one number for each memory, got 3 for 2 rates"):
+    with pytest.raises(ValueError, match="sharpness must be one number for each memory, got 3 for 2"):
         weighting(sharpness=[1.0, 2.0, 3.0], forgetting=[6.0, 0.1])
     with pytest.raises(ValueError, match="forgetting must be a positive number, got 0"):
         weighting(forgetting=[6.0, 0.0])
+    with pytest.raises(ValueError, match="slope must be one number for each memory, got 1 for 2"):
+        weighting(forgetting=[6.0, 0.1], slope=[1.0])
+    with pytest.raises(ValueError, match="relative must be a finite number"):
+        weighting(relative=float("nan"))

@@ -34,26 +34,30 @@ def test_every_number_is_that_of_the_formula(ahead: list[float] | None) -> None:
     primitive = small_primitive(torch.float64)
     filter = ebip(primitive, square_root=True, weigh=True)
     state = state_of(filter)
-    asked = {"phase": [0.5, 0.8, 1.0]} if ahead is None else {"ahead": ahead}
+    asked = {"phase": [0.5, 0.8, 0.97, 1.0]} if ahead is None else {"ahead": ahead}
     with torch.no_grad():
         alone = filter.forecast(state, **asked)
         now, velocity = float(filter.phase(state)), float(filter.phase_velocity(state))
         filter.readout = readout()
         drawn = filter.forecast(state, **asked)
-    share, widening = filter.readout.share.numpy(), filter.readout.widening.numpy()
+    share, widening, near = filter.readout.share.numpy(), filter.readout.widening.numpy(), SECONDS[:-1]
     for i, phase in enumerate(alone.phase.tolist()):
-        seconds = np.clip(max(phase - now, 0) / velocity, SECONDS[0], SECONDS[-1])
+        seconds = np.clip(max(phase - now, 0) / velocity, near[0], near[-1])
+        end = max(phase - 0.95, 0) / 0.05 if ahead is None else float(math.isinf(ahead[i]))
         paths = primitive.basis.project(torch.full((24,), phase, dtype=torch.float64), primitive.weights).numpy()
         for d in range(5):
             own, apart = float(alone.variance[i, d]) ** 0.5, paths[:, d].std(ddof=1)
             level = np.clip(own / apart, LEVELS[0], LEVELS[-1])
-            by_level = [np.interp(seconds, SECONDS, share[d, :, j]) for j in range(J)]
+            by_level = [
+                (1 - end) * np.interp(seconds, near, share[d, :-1, j]) + end * share[d, -1, j] for j in range(J)
+            ]
             s = np.interp(level, LEVELS, by_level)
             mean = paths[:, d].mean()
             np.testing.assert_allclose(
                 float(drawn.mean[i, d]), mean + s * (float(alone.mean[i, d]) - mean), rtol=1e-8
             )
-            wanted = ((1 - s) * apart + s * own) * np.interp(seconds, SECONDS, widening[d])
+            stretched = (1 - end) * np.interp(seconds, near, widening[d, :-1]) + end * widening[d, -1]
+            wanted = ((1 - s) * apart + s * own) * stretched
             np.testing.assert_allclose(float(drawn.variance[i, d]) ** 0.5, wanted, rtol=1e-8)
     weights = alone.weights.unsqueeze(-1)
     assert torch.allclose((weights * drawn.members).sum(-2), drawn.mean)
@@ -112,9 +116,10 @@ def test_a_phase_that_stands_still_is_the_farthest_horizon() -> None:
             torch.ones(2, 2, J),
             torch.ones(2, 2),
             {"seconds": [0.5, 0.5]},
-            "seconds must be at least two, and increase",
+            "seconds must increase",
         ),
-        (torch.ones(2, S, 1), torch.ones(2, S), {"levels": [0.5]}, "levels must be at least two"),
+        (torch.ones(2, S, 1), torch.ones(2, S), {"levels": [-0.5]}, "levels must increase from 0"),
+        (torch.ones(2, S, 0), torch.ones(2, S), {"levels": []}, "levels must increase"),
     ],
 )
 def test_bad_settings_are_named(share, widening, options, message) -> None:

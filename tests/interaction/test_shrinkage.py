@@ -161,6 +161,6 @@ def test_shares_outside_their_range_are_refused() -> None:
         Shrinkage(torch.ones(2, 2), leads=[0.5, 0.5])
     half = Shrinkage(torch.full((1, 5), 0.5))
     same = Forecast(torch.tensor([[2.0]]), torch.tensor([[0.0]]), torch.ones(1), torch.full((1, 3, 1), 2.0))
-    lead = Lead(torch.tensor([0.3]), torch.tensor([0.5]), torch.tensor([1.0]))
+    lead = Lead(*torch.tensor([[0.3], [0.5], [1.0], [0.0]]))
     drawn = half(same, lead, torch.tensor([[0.0]]), torch.tensor([[9.0]]))
     assert drawn.members.isfinite().all()

@@ -30,6 +30,14 @@ def test_it_is_hermites_interpolation() -> None:
         torch.testing.assert_close(table.at(which, phase, some), found[..., some])
 
 
+def test_its_spread_is_that_of_the_values() -> None:
+    values = torch.randn(4, 9, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    table = DemonstrationTable(values, torch.randn(4, 9, 3, dtype=torch.float64))
+    torch.testing.assert_close(table.spread(), values.var(0))
+    torch.testing.assert_close(table.spread(torch.tensor([2, 0])), values.var(0)[:, [2, 0]])
+    assert bool((DemonstrationTable(values[:1], values[:1]).spread() == 0).all())
+
+
 def test_it_is_close_to_the_demonstrations_and_passes_gradients() -> None:
     primitive = small_primitive(torch.float64)
     table = DemonstrationTable.of(primitive)

@@ -3,7 +3,6 @@
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 import safetensors.torch
 import torch
@@ -84,17 +83,6 @@ def test_every_basis_of_the_library_is_kept_exactly(basis: Basis, tmp_path: Path
     again = load_model(tmp_path / "m").primitive.basis
     phase = torch.linspace(-0.2, 1.2, 30, dtype=torch.float64)
     assert torch.equal(again.bases[0](phase), basis(phase))
-
-
-def test_a_file_of_this_version_still_loads() -> None:
-    """It was written by the first version of the format and lies in the repository: every later one reads it."""
-    model = load_model(Path(__file__).parent / "model-v1.safetensors")
-    numbers = np.load(Path(__file__).parent / "model-v1.npz")
-    forecast = model.forecast(torch.from_numpy(numbers["values"]), [0.2, math.inf])
-    np.testing.assert_allclose(forecast.mean.numpy(), numbers["mean"], rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(forecast.variance.numpy(), numbers["variance"], rtol=1e-3, atol=1e-7)
-    assert model.labels is not None
-    assert model.report["chosen"] in model.report["stages"]
 
 
 def test_a_forecast_of_recorded_data_is_the_filter_step_by_step() -> None:

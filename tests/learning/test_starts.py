@@ -1,4 +1,4 @@
-"""Where the gradient starts: the best of a grid, found once."""
+"""Where the gradient starts: the best of what was tried, found once."""
 
 import json
 from pathlib import Path
@@ -10,7 +10,16 @@ from tests.conftest import interactions, small_primitive
 from torch_ebip import BSplineBasis, ForecastObjective, InteractionPrimitive, TuningSettings, select_basis
 from torch_ebip.learning.configuration import Task
 from torch_ebip.learning.held_out import HeldOut
-from torch_ebip.learning.starts import Start, best_factor, best_start, scaled, tunable
+from torch_ebip.learning.starts import (
+    SHARPNESSES,
+    SLOPES,
+    TRIES,
+    Start,
+    best_factor,
+    best_start,
+    scaled,
+    tunable,
+)
 
 
 def test_the_best_factor_does_not_wander_when_asked_again(tmp_path: Path) -> None:
@@ -25,7 +34,7 @@ def test_the_best_factor_does_not_wander_when_asked_again(tmp_path: Path) -> Non
     assert answers[0] == min(losses, key=lambda factor: losses[factor])
 
 
-def test_the_start_is_the_best_of_the_grid(tmp_path: Path) -> None:
+def test_the_start_is_the_best_of_what_was_tried(tmp_path: Path) -> None:
     made = interactions(30)
     primitive = InteractionPrimitive.fit(made, select_basis(made, [BSplineBasis(6)]))
     layout = made.layout
@@ -34,10 +43,18 @@ def test_the_start_is_the_best_of_the_grid(tmp_path: Path) -> None:
     held_out = HeldOut(made, task, TuningSettings(folds=4, thinning=2))
     start = best_start(held_out, 100.0, 6, record=tmp_path / "scan.json")
     losses = json.loads((tmp_path / "scan.json").read_text())
-    assert len(losses) == 17
     best = min(losses, key=lambda entry: entry["loss"])
-    assert start == Start(best["factor"], best["sharpness"], best["balance"], best["primacy"])
-    assert {entry["balance"] for entry in losses} == {0.5, 0.95, 0.05}  # the last one remembers everything
+    assert start == Start(*(best[name] for name in Start._fields))
+    tried = [Start(*(entry[name] for name in Start._fields)) for entry in losses]
+    assert len(set(tried)) == len(tried) <= TRIES
+    assert {entry["primacy"] > 0 for entry in losses} == {True, False}  # with and without what came first
+    if len(tried) < TRIES:
+        # Nothing beside it is better: every neighbour was tried.
+        names, at = ("sharpness", "slope"), start._asdict()
+        for name, axis in zip(names, (SHARPNESSES, SLOPES), strict=True):
+            place = axis.index(at[name])
+            for value in axis[max(place - 1, 0) : place + 2]:
+                assert Start(**(at | {name: value})) in tried
     filter = tunable(primitive, start)
     shares = [start.balance * start.sharpness, (1 - start.balance) * start.sharpness]
     assert filter.analysis.weighting.sharpness.value.tolist() == pytest.approx(shares)

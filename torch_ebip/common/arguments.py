@@ -66,6 +66,34 @@ def as_number(
     raise ValueError(f"{name} must be a {kind} number{of and ' ' + of}, got {number}")
 
 
+def as_numbers(
+    name: str,
+    values: Any,
+    count: int,
+    what: str,
+    low: float = -math.inf,
+    high: float = math.inf,
+    *,
+    above: bool = False,
+) -> list[float]:
+    """As many numbers as there are of something: those given, or one for all of them.
+
+    Args:
+        name: of the argument, for errors.
+        values: a number or a list.
+        count: how many.
+        what: they must be, for errors: "one number for each memory".
+        low, high, above: of each, see `as_number`.
+
+    Raises:
+        ValueError: more or fewer, none, or one that `as_number` refuses.
+    """
+    each = list(values) if isinstance(values, list | tuple) else [values] * count
+    if len(each) != count or not count:
+        raise ValueError(f"{name} must be {what}, got {len(each)} for {count}")
+    return [as_number(name, value, low, high, above=above) for value in each]
+
+
 def as_seconds(dt: Any, like: Tensor) -> Tensor:
     """A step of time in the dtype and on the device of ``like`` [...].
 

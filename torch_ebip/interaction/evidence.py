@@ -9,6 +9,9 @@ Near, because the phase is known to a few hundredths only, and two demonstration
 seem to differ by their movement in between: the likelihood is averaged over a few phases about the member's.
 Where the demonstrations are comes from a `DemonstrationTable`.
 
+Far and near are measured by how far demonstrations lie apart there: where all of them are close together a centimetre
+tells much, where they have spread out it tells little.
+
 How far back it looks is a question of the interaction: a hand that hesitates is told by its last tenths of a second,
 an action whose end looks like another's by how it began. So there may be several memories that forget at rates of
 their own, a fast and a slow one; how much each counts is learned.
@@ -23,7 +26,7 @@ import torch
 from torch import Tensor
 
 from torch_ebip.common.ambient import owned
-from torch_ebip.common.arguments import as_number
+from torch_ebip.common.arguments import as_number, as_numbers
 from torch_ebip.common.brief import brief
 from torch_ebip.common.modules import Versions, sharing
 from torch_ebip.filtering.model import StateSpace
@@ -32,6 +35,9 @@ from torch_ebip.filtering.protocols import View
 from torch_ebip.filtering.updates.weighting import Seen, Weighting
 from torch_ebip.interaction.table import KEPT, DemonstrationTable
 from torch_ebip.recordings.layout import Layout
+
+LEAST_SPREAD = 0.1
+"""Of a DoF's variance, added to that at a phase: where all demonstrations are at one place noise would decide."""
 
 
 class Evidence(NamedTuple):
@@ -55,7 +61,7 @@ class _Constants(NamedTuple):
     """What depends on parameters alone.
 
     Attributes:
-        scale: [k], of squared distances, divided by k.
+        scale: [P, 2, k], of squared distances, divided by k: between P + 1 phases its value and its rise over a cell.
         sharpness: [M], half of it.
         slope: [M].
         primacy: [M].
@@ -81,8 +87,9 @@ class EvidenceWeighting(Weighting):
 
         exp(-t D_j^2 / 2) = sum_o p_o exp(-t D_jo^2 / 2),  p_o ~ exp(-o^2 / (2 wander^2)),
 
-    where D_jo^2 is the mean over measured DoFs of the squared distance at the member's phase + o, in units of
-    each DoF's variance, times a factor for its modality.
+    where D_jo^2 is the mean over measured DoFs of the squared distance at the member's phase + o, times a factor for
+    its modality, in units of v_d (s_d(phase) + `LEAST_SPREAD`)^relative: v_d the DoF's variance, s_d(phase) that over
+    the demonstrations at the mean phase, as a share of it.
 
     Args:
         table: of the demonstrations, numbered as in the prior.
@@ -90,8 +97,11 @@ class EvidenceWeighting(Weighting):
         modality_of_dof: int64 [D].
         sharpness: 1/h at the start, of each memory or of all; learned. The larger, the fewer demonstrations speak.
         forgetting: rate of each memory at the start, 1/s; learned. 0.01 remembers a whole interaction.
-        slope: of the log sharpness over phase at the start; learned, for each memory.
+        slope: of the log sharpness over phase at the start, of each memory or of all; learned. Below 0 fewer speak
+            early than late.
         primacy: how much more each memory, or all, holds of what came first, at the start; learned. 0: all alike.
+        relative: how far distances are relative to the spread at a phase, at the start; learned. 0: to each DoF's
+            variance alone, 1: to the spread.
         defensive: share that is spread evenly over all members, so that no weight vanishes.
         wander: uncertainty of a member's phase at the start, a standard deviation; learned.
         offsets: [O], from a member's phase to where its demonstration is compared.
@@ -111,26 +121,21 @@ class EvidenceWeighting(Weighting):
         modality_of_dof: Tensor,
         sharpness: float | Sequence[float] = 10.0,
         forgetting: float | Sequence[float] = 6.0,
-        slope: float = 2.0,
+        slope: float | Sequence[float] = 2.0,
         primacy: float | Sequence[float] = 0.0,
+        relative: float = 0.0,
         defensive: float = 0.02,
         wander: float = 0.08,
         offsets: Sequence[float] = (-0.1, -0.05, 0.0, 0.05, 0.1),
     ) -> None:
         super().__init__()
-        rates = [forgetting] if isinstance(forgetting, int | float) else list(forgetting)
-        sharp = [sharpness] * len(rates) if isinstance(sharpness, int | float) else list(sharpness)
-        first = [primacy] * len(rates) if isinstance(primacy, int | float) else list(primacy)
-        for name, values in {"sharpness": sharp, "primacy": first}.items():
-            if len(values) != len(rates) or not rates:
-                raise ValueError(
-                    f"{name} must be one number for each memory, got {len(values)} for {len(rates)} rates"
-                )
-        for value in first:
-            as_number("primacy", value)
-        for name, values in {"sharpness": sharp, "forgetting": rates, "slope": [slope], "wander": [wander]}.items():
-            for value in values:
-                as_number(name, value, 0, above=True)
+        count = 1 if isinstance(forgetting, int | float) else len(forgetting)
+        what = "one number for each memory"
+        sharp = as_numbers("sharpness", sharpness, count, what, 0, above=True)
+        rates = as_numbers("forgetting", forgetting, count, what, 0, above=True)
+        first, rise = as_numbers("primacy", primacy, count, what), as_numbers("slope", slope, count, what)
+        as_number("relative", relative)
+        as_number("wander", wander, 0, above=True)
         if not 0 < as_number("defensive", defensive) < 1:
             raise ValueError(f"defensive must lie between 0 and 1, got {defensive}")
         if table.n_dofs != len(variance) or len(modality_of_dof) != len(variance):
@@ -143,8 +148,9 @@ class EvidenceWeighting(Weighting):
         self.register_buffer("modality_of_dof", owned(modality_of_dof))
         self.sharpness = Positive(variance.new_tensor(sharp))
         self.forgetting = Positive(variance.new_tensor(rates))
-        self.slope = Positive(variance.new_tensor([slope] * len(rates)))
+        self.slope = Signed(variance.new_tensor(rise))
         self.primacy = Signed(variance.new_tensor(first))
+        self.relative = Signed(variance.new_tensor(relative))
         self.factor = Positive(variance.new_ones(int(modality_of_dof.max()) + 1))
         self.wander = Positive(variance.new_tensor(wander))
         self.register_buffer("offsets", owned(variance.new_tensor(offsets)))
@@ -179,7 +185,7 @@ class EvidenceWeighting(Weighting):
 
     def named_values(self, layout: Layout) -> dict[str, float]:
         """See `Part.named_values`: ``weighting/...``, of several memories ``.../1`` and on; factors by modality."""
-        values = {"weighting/wander": float(self.wander.value)}
+        values = {f"weighting/{name}": float(getattr(self, name).value.detach()) for name in ("wander", "relative")}
         for name in ("sharpness", "forgetting", "slope", "primacy"):
             each = getattr(self, name).value.tolist()
             numbers = [f"/{i}" for i in range(1, len(each) + 1)] if len(each) > 1 else [""]
@@ -221,7 +227,8 @@ class EvidenceWeighting(Weighting):
             seen: what was measured.
         """
         y, observed, trust = seen.y, seen.observed, seen.trust
-        scale, sharpness, slope, primacy, prior = self._constants(seen.rows)
+        cells, sharpness, slope, primacy, prior = self._constants(seen.rows)
+        scale = _at(cells, seen.mean.select(-1, 0))
         K = y.shape[-1]
         if observed is None:
             difference, share, count = paths - (y if y.ndim == 1 else y[..., None, None, :]), trust, None
@@ -268,7 +275,21 @@ class EvidenceWeighting(Weighting):
         modality = self.modality_of_dof if rows is None else self.modality_of_dof[rows]
         # A DoF that never moved in the demonstrations says nothing about which of them this is.
         scale = torch.where(variance > 0, self.factor.value[modality] / torch.where(variance > 0, variance, 1), 0)
+        spread = self.table.spread(rows) / torch.where(variance > 0, variance, 1) + LEAST_SPREAD  # [P + 1, k]
+        scale = scale * spread.pow(-self.relative.value) / len(variance)
         prior = torch.log_softmax(-0.5 * (self.offsets / self.wander.value).square(), -1)
         return _Constants(
-            scale / len(variance), 0.5 * self.sharpness.value, self.slope.value, self.primacy.value, prior
+            torch.stack([scale[:-1], scale.diff(dim=0)], 1),
+            0.5 * self.sharpness.value,
+            self.slope.value,
+            self.primacy.value,
+            prior,
         )
+
+
+def _at(cells: Tensor, phase: Tensor) -> Tensor:
+    """What lies linearly between phases evenly from 0 to 1, [..., k], of cells [P, 2, k] at a phase [...]."""
+    place = phase.clamp(0, 1) * len(cells)
+    cell = place.detach().floor().clamp(max=len(cells) - 1)
+    value, rise = cells.index_select(0, cell.long().reshape(-1)).view(*phase.shape, 2, -1).unbind(-2)
+    return torch.addcmul(value, (place - cell).unsqueeze(-1), rise)

@@ -114,13 +114,14 @@ class InteractionFilter(Filter):
         """
         if ahead is not None and phase is not None:
             raise ValueError("a forecast is of phases or of seconds ahead, got both")
-        if ahead is not None:
-            forecast = self._forecast_ahead(state, as_seconds_ahead(ahead, state[0]))
+        seconds = None if ahead is None else as_seconds_ahead(ahead, state[0])
+        if seconds is not None:
+            forecast = self._forecast_ahead(state, seconds)
         else:
             forecast = self._forecast(state, self._phases_ahead(state, phase))
         if self.readout is None:
             return forecast
-        lead = self.lead(state, forecast.phase)
+        lead = self.lead(state, forecast.phase, seconds)
         return self.readout(forecast, lead, *self.demonstrated(lead.phase))
 
     @abstractmethod
@@ -131,10 +132,10 @@ class InteractionFilter(Filter):
     def _forecast_ahead(self, state: State, ahead: Tensor) -> Forecast:
         """What a state implies so many seconds ahead, [P]; infinity is the end."""
 
-    def lead(self, state: State, phase: Tensor) -> Lead:
-        """How far ahead of a ``state`` each ``phase`` [..., P] lies."""
+    def lead(self, state: State, phase: Tensor, asked: Tensor | None = None) -> Lead:
+        """How far ahead of a ``state`` each ``phase`` [..., P] lies, of seconds [P] if those were ``asked`` for."""
         moving = self.moving(state)
-        return lead_of(moving[..., 0], self.phase_model.velocity(moving), phase)
+        return lead_of(moving[..., 0], self.phase_model.velocity(moving), phase, asked)
 
     def demonstrated(self, phase: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of the demonstrations at phases [..., P]: [..., P, D], units of the DoFs and squared."""

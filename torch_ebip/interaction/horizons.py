@@ -5,10 +5,14 @@ where all interactions end alike the mean is the best forecast of the end, and s
 deserves less, the less the filter has found out. So the share s of the way from the mean m to the forecast f,
 m + s (f - m), is learned by how many seconds ahead it is, and by how wide the filter's belief still is, as a share of
 how far demonstrations lie apart (James & Stein 1961; Breiman's stacking, 1996).
+
+The end is a horizon of its own, however near the filter takes it to be: one that believes in an end that is not there
+is as sure of it as of the next moment.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -20,8 +24,8 @@ from torch_ebip.filtering.protocols import View
 from torch_ebip.interaction.forecast import Forecast
 from torch_ebip.interaction.readout import Lead, Widths, hats, moved, widths_of
 
-SECONDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
-"""Horizons for which shares are learned; far ones are of the end alone."""
+SECONDS = (0.1, 0.25, 0.5, 1.0, math.inf)
+"""Horizons, s, that have shares; infinity is the end."""
 LEVELS = (0.25, 0.6, 1.0)
 """Widths of the filter's belief, as shares of the demonstrations' deviation, for which they are learned."""
 
@@ -34,7 +38,8 @@ class HorizonShrinkage(nn.Module):
     Args:
         share: [D, K, J], s at the seconds and the levels; from 0 (the demonstrations' mean) to 1 (the filter).
         widening: [D, K], c, above 0.
-        seconds: [K] increasing; between them s is linear, before the first and behind the last as there.
+        seconds: [K] increasing; between them s is linear, before the first and behind the last as there. Infinity,
+            the last, is the end; without it the end is as far ahead as the filter says.
         levels: [J] increasing, of sigma_f / sigma_m; as the seconds.
 
     Raises:
@@ -45,9 +50,9 @@ class HorizonShrinkage(nn.Module):
         >>> import torch
         >>> from torch_ebip.interaction import Forecast, HorizonShrinkage
         >>> from torch_ebip.interaction.readout import Lead
-        >>> half = HorizonShrinkage(torch.full((1, 6, 3), 0.5), torch.ones(1, 6))
+        >>> half = HorizonShrinkage(torch.full((1, 5, 3), 0.5), torch.ones(1, 5))
         >>> forecast = Forecast(torch.tensor([[2.0]]), torch.tensor([[1.0]]), torch.ones(1))
-        >>> lead = Lead(torch.tensor([0.3]), torch.tensor([0.5]), torch.tensor([1.0]))
+        >>> lead = Lead(*torch.tensor([[0.3], [0.5], [0.9], [0.0]]))
         >>> half(forecast, lead, torch.tensor([[0.0]]), torch.tensor([[9.0]])).mean.tolist()
         [[1.0]]
     """
@@ -68,8 +73,8 @@ class HorizonShrinkage(nn.Module):
         places = {name: as_values(name, list(given), None, share) for name, given in
                   (("seconds", seconds), ("levels", levels))}  # fmt: skip
         for name, values in places.items():
-            if len(values) < 2 or not bool((values.diff() > 0).all()):
-                raise ValueError(f"{name} must be at least two, and increase, got {values.tolist()}")
+            if not len(values) or not bool((values.diff() > 0).all() & (values >= 0).all()):
+                raise ValueError(f"{name} must increase from 0 or more, got {values.tolist()}")
         shape = (len(places["seconds"]), len(places["levels"]))
         if share.ndim != 3 or share.shape[1:] != shape or not bool(((share >= 0) & (share <= 1)).all()):
             raise ValueError(f"share must be [D, {shape[0]}, {shape[1]}] between 0 and 1, got {list(share.shape)}")
@@ -118,8 +123,13 @@ class HorizonShrinkage(nn.Module):
 
 
 def horizon_hats(lead: Lead, seconds: Tensor) -> Tensor:
-    """Weights [..., P, K] of the shares at ``seconds`` [K], s, for a lead; they sum to 1."""
-    return hats(lead.seconds.clamp(seconds[0], seconds[-1]), seconds)
+    """Weights [..., P, K] of the shares at ``seconds`` [K], s, perhaps infinity last, at a lead; they sum to 1."""
+    if not seconds[-1].isinf():
+        return hats(lead.seconds.clamp(seconds[0], seconds[-1]), seconds)
+    if len(seconds) == 1:
+        return hats(lead.seconds, seconds)
+    near, end = seconds[:-1], lead.end.unsqueeze(-1)
+    return torch.cat([(1 - end) * hats(lead.seconds.clamp(near[0], near[-1]), near), end], -1)
 
 
 def level_hats(widths: Widths, levels: Tensor) -> Tensor:

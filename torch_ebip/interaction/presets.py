@@ -49,6 +49,8 @@ def ebip(
     sharpness: float | Sequence[float] = 10.0,
     forgetting: float | Sequence[float] = 6.0,
     primacy: float | Sequence[float] = 0.0,
+    slope: float | Sequence[float] = 2.0,
+    relative: float = 0.0,
     phase: PhaseModel | None = None,
 ) -> InteractionEnsembleFilter:
     """The paper's eBIP (Section IV): members are demonstrations, R is the closed form.
@@ -70,6 +72,8 @@ def ebip(
         sharpness: of that evidence at the start, of each memory or of all.
         forgetting: rates of its memories at the start, 1/s: several look back by several lengths of time.
         primacy: how much more they hold of what came first, at the start.
+        slope: how much more that evidence counts late than early, at the start.
+        relative: how far its distances are relative to the spread of the demonstrations there, at the start.
         phase: how the phase moves; default: the paper's `ConstantVelocityPhase`.
 
     Returns:
@@ -84,7 +88,7 @@ def ebip(
         modality_of_dof = primitive.layout.modality_of_dof.to(primitive.weights.device)
         table = DemonstrationTable.of(primitive)
         weighting = EvidenceWeighting(
-            table, primitive.value_variance, modality_of_dof, sharpness, forgetting, primacy=primacy
+            table, primitive.value_variance, modality_of_dof, sharpness, forgetting, slope, primacy, relative
         )
     update = Update(
         SquareRoot() if square_root else Stochastic(),

@@ -11,6 +11,9 @@ from torch_ebip.common.brief import brief
 from torch_ebip.filtering.protocols import View
 from torch_ebip.interaction.forecast import Forecast
 
+NEAR = 0.95
+"""Phase from which a path that is asked for by its phases becomes its end."""
+
 
 class Lead(NamedTuple):
     """How far ahead a forecast is.
@@ -19,11 +22,13 @@ class Lead(NamedTuple):
         ahead: [..., P], in phase.
         seconds: [..., P], s.
         phase: [..., P], of what is forecast.
+        end: [..., P], 0 to 1: how far it is the interaction's end that is asked for, whenever that may be.
     """
 
     ahead: Tensor
     seconds: Tensor
     phase: Tensor
+    end: Tensor
 
     def __repr__(self) -> str:
         return brief(self)
@@ -54,17 +59,28 @@ class Readout(Protocol):
         """The same for a view of the model."""
 
 
-def lead_of(phase: Tensor, velocity: Tensor, of: Tensor) -> Lead:
-    """How far phases ``of`` [..., P] lie ahead of a phase [...] at a velocity [...], 1/s; at rest: for ever."""
+def lead_of(phase: Tensor, velocity: Tensor, of: Tensor, asked: Tensor | None = None) -> Lead:
+    """How far phases ``of`` [..., P] lie ahead of a phase [...] at a velocity [...], 1/s; at rest: for ever.
+
+    Args:
+        phase: [...], where the interaction is.
+        velocity: [...], 1/s.
+        of: [..., P], what is forecast.
+        asked: [P], the seconds ahead that were asked for; infinity is the end. Default: phases were, and the end is
+            the last of them, which others approach from `NEAR` on.
+    """
     of, velocity = of.clamp(0, 1), velocity.unsqueeze(-1)
+    end = (of - NEAR) / (1 - NEAR) if asked is None else asked.isinf().to(of).expand_as(of)
     ahead = (of - phase.clamp(0, 1).unsqueeze(-1)).clamp(min=0)
     going = velocity > 0
     seconds = torch.where(going, ahead / torch.where(going, velocity, 1), torch.inf)
-    return Lead(ahead, torch.where(ahead > 0, seconds, 0), of)
+    return Lead(ahead, torch.where(ahead > 0, seconds, 0), of, end.clamp(0, 1))
 
 
 def hats(lead: Tensor, leads: Tensor) -> Tensor:
     """Weights [..., K] of linear interpolation between leads [K], increasing, at a lead [...] within them."""
+    if len(leads) == 1:
+        return leads.new_ones(*lead.shape, 1)
     right = torch.searchsorted(leads, lead.contiguous(), right=True).clamp(1, len(leads) - 1)
     left = right - 1
     part = ((lead - leads[left]) / (leads[right] - leads[left])).unsqueeze(-1)

@@ -43,7 +43,7 @@ class Shrinkage(nn.Module):
         >>> from torch_ebip.interaction.readout import Lead
         >>> half = Shrinkage(torch.full((1, 5), 0.5))
         >>> forecast = Forecast(torch.tensor([[2.0]]), torch.tensor([[1.0]]), torch.ones(1))
-        >>> lead = Lead(torch.tensor([0.3]), torch.tensor([0.5]), torch.tensor([1.0]))
+        >>> lead = Lead(*torch.tensor([[0.3], [0.5], [1.0], [0.0]]))
         >>> half(forecast, lead, torch.tensor([[0.0]]), torch.tensor([[9.0]])).mean.tolist()
         [[1.0]]
     """

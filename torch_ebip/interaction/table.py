@@ -97,6 +97,12 @@ class DemonstrationTable(nn.Module):
         constant, linear, square, cube = found.unbind(-2)
         return torch.addcmul(constant, t, torch.addcmul(linear, t, torch.addcmul(square, t, cube)))
 
+    def spread(self, dofs: Tensor | None = None) -> Tensor:
+        """Variance over the demonstrations at the phases of the grid, [P, k], squared units, of DoFs int64 [k]."""
+        cells = self.cells if dofs is None else self.cells[..., dofs]
+        ends = torch.cat([cells[:, :, 0], cells[:, -1:].sum(2)], 1)
+        return ends.var(0, correction=1 if len(ends) > 1 else 0)
+
     def _part(self, dofs: Tensor) -> Tensor:
         """The cells of some DoFs, int64 [k]; those asked for lately are kept while the table is the same."""
         if self.cells.is_inference():

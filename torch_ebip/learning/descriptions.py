@@ -5,13 +5,14 @@ Nothing is looked up by a name that a file chooses: every family that can be bui
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from torch_ebip.filtering.noise.constraints import AboveOne
+from torch_ebip.filtering.noise.constraints import AboveOne, Positive
 from torch_ebip.filtering.updates.cauchy import Cauchy
 from torch_ebip.filtering.updates.gate import Gate
 from torch_ebip.filtering.updates.huber import Huber
@@ -50,6 +51,8 @@ OPTIONS = (
     "weigh",
     "forgetting",
     "primacy",
+    "slope",
+    "relative",
     "localise",
     "weight_noise",
     "context",
@@ -124,6 +127,8 @@ def describe_filter(filter: InteractionFilter, primitive: InteractionPrimitive) 
         "weigh": update.weighting is not None,
         "forgetting": weighting.forgetting.start.tolist() if isinstance(weighting, EvidenceWeighting) else 6.0,
         "primacy": weighting.primacy.start.tolist() if isinstance(weighting, EvidenceWeighting) else 0.0,
+        "slope": weighting.slope.start.tolist() if isinstance(weighting, EvidenceWeighting) else 2.0,
+        "relative": weighting.relative.start.item() if isinstance(weighting, EvidenceWeighting) else 0.0,
         "localise": update.localisation is not None,
         "weight_noise": isinstance(filter.model.process_noise, InteractionNoise)
         and filter.model.process_noise.weights is not None,
@@ -194,6 +199,20 @@ def own_tensors(filter: nn.Module, made: nn.Module) -> dict[str, Tensor]:
     return {name: tensor for name, tensor in tensors_of(filter).items() if not torch.equal(tensor, theirs[name])}
 
 
+def updated(description: Description, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Tensors [...] by name of a filter that a file described, as this version names and means them."""
+    tensors = dict(tensors)
+    for name, tensor in tensors.items():  # of a single memory, which had no dimension of its own
+        if tensor.ndim == 0 and name.split(".")[-2] in ("sharpness", "forgetting", "slope"):
+            tensors[name] = tensor.unsqueeze(0)
+    raw = "analysis.weighting.slope.raw"
+    if raw in tensors and "slope" not in description:  # it could only be positive, and started at 2
+        former = Positive(torch.full_like(tensors[raw], 2.0))
+        former.load_state_dict({"start": former.start, "raw": tensors[raw]})
+        tensors[raw] = former.value.detach() - former.start
+    return tensors
+
+
 @torch.no_grad()
 def fill(filter: nn.Module, tensors: Mapping[str, Tensor]) -> None:
     """Give a filter the tensors [...] by name, all of those that it does not have from its primitive.
@@ -203,8 +222,6 @@ def fill(filter: nn.Module, tensors: Mapping[str, Tensor]) -> None:
     """
     places = tensors_of(filter)
     for name, tensor in tensors.items():
-        if name in places and places[name].shape == (1,) and tensor.shape == ():  # a memory in older files
-            tensor = tensor.unsqueeze(0)
         if name not in places or places[name].shape != tensor.shape:
             expected = list(places[name].shape) if name in places else "none of that name"
             raise ValueError(f"a tensor {name} {list(tensor.shape)}, expected {expected}")
@@ -222,7 +239,8 @@ def _describe_readout(readout: Readout | None) -> Any:
     if readout is None:
         return None
     if isinstance(readout, HorizonShrinkage):
-        return {"seconds": readout.seconds.tolist(), "levels": readout.levels.tolist()}
+        seconds = [s if math.isfinite(s) else "end" for s in readout.seconds.tolist()]
+        return {"seconds": seconds, "levels": readout.levels.tolist()}
     if isinstance(readout, Shrinkage):
         return readout.leads.tolist()
     raise TypeError(f"a model file keeps the read-outs of the library, not {type(readout).__name__}")
@@ -233,7 +251,8 @@ def _readout_of(description: Any, primitive: InteractionPrimitive) -> Readout:
     D = primitive.layout.n_dofs
     if isinstance(description, list):  # of older files
         return Shrinkage(ones(D, len(description)), description)
-    seconds, levels = description["seconds"], description["levels"]
+    seconds = [math.inf if s == "end" else float(s) for s in description["seconds"]]
+    levels = description["levels"]
     return HorizonShrinkage(ones(D, len(seconds), len(levels)), ones(D, len(seconds)), seconds, levels)
 
 

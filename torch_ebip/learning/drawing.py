@@ -15,7 +15,7 @@ from torch import Tensor
 from torch_ebip.common.ambient import without_autocast
 from torch_ebip.common.brief import brief
 from torch_ebip.interaction.filters import InteractionFilter
-from torch_ebip.interaction.horizons import LEVELS, SECONDS, HorizonShrinkage, horizon_hats, level_hats
+from torch_ebip.interaction.horizons import LEVELS, HorizonShrinkage, horizon_hats, level_hats
 from torch_ebip.interaction.readout import widths_of
 from torch_ebip.learning.held_out import HeldOut
 from torch_ebip.learning.metrics import Z95
@@ -89,13 +89,14 @@ def learn_drawing(held_out: HeldOut, filter: InteractionFilter, interactions: Te
     """
     task = held_out.task
     layout, objective = task.primitive.layout, task.objective
-    names = objective.horizons
+    names, ahead = objective.horizons, objective.ahead
     assert names is not None
+    assert ahead is not None
     said = _said(held_out, filter, interactions)
     device = said.towards.device
     fold = held_out.partition.fold_of.to(device)[said.interaction]
     modality = layout.modality_of_dof.to(device)[task.targets]
-    S, J, D = len(SECONDS), len(LEVELS), layout.n_dofs
+    S, J, D = said.place.shape[-1], len(LEVELS), layout.n_dofs
     share, widening = said.own.new_ones(D, S, J), said.own.new_ones(D, S)
     drawn, deviation = torch.zeros_like(said.towards), torch.zeros_like(said.towards)
     shares: dict[str, dict[str, float]] = {}
@@ -117,26 +118,27 @@ def learn_drawing(held_out: HeldOut, filter: InteractionFilter, interactions: Te
     scale = objective.scale
     after = tally(held_out, (drawn - said.wanted)[told] * scale, deviation[told] * scale)
     gains = [{name: _gain(said, other, p, told) for p, name in enumerate(names)} for other in (drawn, said.towards)]
-    return Drawn(HorizonShrinkage(share, widening), shares, scores_of(after), *gains)
+    return Drawn(HorizonShrinkage(share, widening, ahead.tolist()), shares, scores_of(after), *gains)
 
 
 def _said(held_out: HeldOut, filter: InteractionFilter, interactions: Tensor) -> Said:
     """What a filter says of interactions int64 [B], with every set of sensors; of all processes together."""
     task = held_out.task
     primitive, targets, objective = task.primitive, task.targets, task.objective
-    scale = objective.scale
+    scale, ahead = objective.scale, objective.ahead
+    assert ahead is not None
     parts: list[Said] = []
     for subset in task.subsets.values():
         for trial in held_out.trials(filter, interactions, subset):
             shown, state = trial.shown, trial.trace.kept
             forecast = trial.forecast(objective)
-            lead = trial.filter.lead(state, forecast.phase)
+            lead = trial.filter.lead(state, forecast.phase, ahead)
             weights = primitive.weights[shown.members].mean(1)[:, None, None, :]
             mean = primitive.basis.project(lead.phase, weights)[..., targets]
             _, variance = trial.filter.demonstrated(lead.phase)
             widths = widths_of(forecast, variance[..., shown.targets])
             level = level_hats(widths, scale.new_tensor(LEVELS))
-            place = horizon_hats(lead, scale.new_tensor(SECONDS))
+            place = horizon_hats(lead, ahead)
             values = (forecast.mean - mean, shown.truth - mean, widths.own, widths.demonstrated)
             towards, wanted, own, apart = (value / scale for value in values)
             parts.append(Said(shown.interactions, towards, wanted, own, apart, level, place))

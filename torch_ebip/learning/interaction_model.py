@@ -26,6 +26,7 @@ from torch_ebip.learning.descriptions import (
     own_tensors,
     stack_of,
     tensors_of,
+    updated,
 )
 from torch_ebip.learning.groups import groups_of
 from torch_ebip.learning.model_file import read_model_file, write_model_file
@@ -173,7 +174,7 @@ class InteractionModel:
                 layout, basis, float(description["rate"]), **parts["primitive"], labels=labels
             )
             filter = build_filter(primitive, description["filter"])
-            fill(filter, parts["filter"])
+            fill(filter, updated(description["filter"], parts["filter"]))
             return cls(filter, primitive, Report(description["report"]), tuple(description["targets"]))
         except (AttributeError, ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:
             raise ValueError(f"{path}: a model whose parts do not fit together: {error}") from error

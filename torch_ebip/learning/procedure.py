@@ -38,7 +38,7 @@ from torch_ebip.learning.settings import TuningSettings
 from torch_ebip.learning.stages import Scores, reference_scores, score
 from torch_ebip.learning.starts import (
     FACTORS,
-    SHARPNESSES,
+    TRIES,
     Start,
     best_factor,
     best_start,
@@ -80,9 +80,7 @@ class Procedure:
     @property
     def work(self) -> int:
         """Units: every filter that is tried, and every step."""
-        tried = len(FACTORS) + 2 + 3 * len(SHARPNESSES)
-        tried += 2 + 2 * len(SHARPNESSES) if self.memories == 2 else 0
-        return tried + (self.steps if self.tunes else 0) + 5
+        return len(FACTORS) + 2 + TRIES + (self.steps if self.tunes else 0) + 5
 
     def prepare(
         self, arm: RobotArm | ForwardKinematicsLoss | None, joints: str | None, basis: StackedBasis | None

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,13 +25,19 @@ from torch_ebip.learning.held_out import HeldOut
 
 FACTORS = (1.0, 10.0, 100.0, 1000.0, 10000.0)
 """Coarse grid of factors on the closed-form R; the best one is refined by half-decades."""
-SHARPNESSES = (3.16, 10.0, 31.6)
-"""Of the evidence weights, tried with every half-decade of R up to the best factor."""
+SHARPNESSES = (1.0, 3.16, 10.0, 31.6, 100.0)
+"""Of the evidence weights. With more of it one member speaks, and no gradient leads away from that."""
 FORGETTING = (6.0, 0.01)
 """Rates of the memories, 1/s: a sixth of a second, and the whole interaction."""
-MEMORIES = ((0.5, 0.0), (0.95, 0.0), (0.05, 0.0), (0.5, 4.0), (0.05, 4.0))
+MEMORIES = ((0.95, 0.0), (0.5, 0.0), (0.05, 0.0), (0.05, 4.0), (0.05, 8.0))
 """Shares of the fast memory in the sharpness, and the primacy of the slow one: how much more it holds of what came
-first. The first pair is tried with every sharpness, others without primacy with the best, with it with every one."""
+first. From none of the past to its beginning."""
+FIRST = (1, 3)
+"""Which of them are tried first."""
+SLOPES = (-2.0, 0.0, 2.0)
+"""How much more the evidence counts late than early."""
+TRIES = 28
+"""Starts that are tried, at most."""
 INFLATION = 1.002
 """Of the anomalies a sample, where the gradient starts."""
 
@@ -39,13 +45,15 @@ INFLATION = 1.002
 class Start(NamedTuple):
     """Where the gradient starts: a factor on R, the sharpness of the evidence weights, and the memories.
 
-    ``balance`` is the fast memory's share of the sharpness, None if it is alone; ``primacy`` is the slow one's.
+    ``balance`` is the fast memory's share of the sharpness, None if it is alone; ``primacy`` is the slow one's,
+    ``slope`` that of both.
     """
 
     factor: float
     sharpness: float
     balance: float | None = None
     primacy: float = 0.0
+    slope: float = 2.0
 
 
 def scaled(primitive: InteractionPrimitive, factor: float, members: int | None = None) -> InteractionEnsembleFilter:
@@ -79,6 +87,8 @@ def tunable(
         sharpness=sharpness,
         forgetting=FORGETTING[0] if start.balance is None else FORGETTING,
         primacy=0.0 if start.balance is None else (0.0, start.primacy),
+        slope=start.slope,
+        relative=1.0,
     )
 
 
@@ -143,17 +153,15 @@ def best_start(
     tick: Callable[[], None] = lambda: None,
     memories: int = 2,
 ) -> Start:
-    """The start of `tunable` with the smallest loss: half-decades of R up to a factor, `SHARPNESSES`, `MEMORIES`.
-
-    The factor is the best one without evidence weights, which take over a part of what a large R is for.
+    """The start of `tunable` with the smallest loss: the best of a few, and from there downhill, an axis at a time.
 
     Args:
         held_out: the demonstrations, and what is asked of them.
-        factor: the best one, see `best_factor`.
+        factor: the best one without evidence weights, which take over a part of what a large R is for.
         interactions: how many of them decide.
         members: E of the filter.
         record: file of the losses, written when all are known; if it exists, its best start is returned.
-        tick: called after each filter that was tried.
+        tick: called `TRIES` times, after each filter that was tried.
         memories: 2, a fast and a slow one; or 1.
 
     Raises:
@@ -161,31 +169,52 @@ def best_start(
     """
     if record is None or not record.exists():
         order = scanned(held_out, interactions)
-        losses: list[dict[str, Any]] = []
-        pairs: Sequence[tuple[float | None, float]] = MEMORIES if memories == 2 else [(None, 0.0)]
+        kept: Sequence[tuple[float | None, float]] = MEMORIES if memories == 2 else [(None, 0.0)]
+        scales = [float(f"{factor * 10 ** (half / 2):.4g}") for half in range(-4, 3)]
+        axes = (scales, SHARPNESSES, kept, SLOPES)
+        losses: dict[tuple[int, ...], float] = {}
 
-        def measure(start: Start) -> None:
-            """The loss of a filter that starts there."""
-            filter = tunable(held_out.task.primitive, start, members)
-            losses.append({**start._asdict(), "loss": held_out.evaluate(filter, order)["loss"]})
+        def start_at(place: tuple[int, ...]) -> Start:
+            """Of a number on each axis."""
+            return Start(scales[place[0]], SHARPNESSES[place[1]], *kept[place[2]], SLOPES[place[3]])
+
+        def measure(place: tuple[int, ...]) -> float:
+            """The loss of a filter that starts there; once known, or when enough were tried, no other is asked."""
+            inside = all(0 <= i < len(axis) for i, axis in zip(place, axes, strict=True))
+            if inside and place not in losses and len(losses) < TRIES:
+                filter = tunable(held_out.task.primitive, start_at(place), members)
+                losses[place] = _loss(held_out.evaluate(filter, order)["loss"])
+                tick()
+            return losses.get(place, math.inf)
+
+        _descend(measure, list(product((2, 4, 6), (2, 4), FIRST if memories == 2 else (0,), (2,))))
+        for _ in range(TRIES - len(losses)):
             tick()
-
-        for half, sharpness in product((-1.0, -0.5, 0.0), SHARPNESSES):
-            measure(Start(float(f"{factor * 10**half:.4g}"), sharpness, *pairs[0]))
-        first = min(losses, key=lambda entry: _loss(entry["loss"]))
-        for pair in pairs[1:]:
-            # What came first tells little of where a hand is now: it takes more sharpness to be heard.
-            for sharpness in SHARPNESSES if pair[1] else (first["sharpness"],):
-                measure(Start(first["factor"], sharpness, *pair))
+        known = [{**start_at(place)._asdict(), "loss": loss} for place, loss in losses.items()]
         if record is not None and held_out.ranks.first:
-            write_json(record, losses)
+            write_json(record, known)
     else:
-        losses = read_json(record)
+        known = read_json(record)
     try:
-        best = min(losses, key=lambda entry: _loss(entry["loss"]))
-        return Start(best["factor"], best["sharpness"], best["balance"], best["primacy"])
+        best = min(known, key=lambda entry: _loss(entry["loss"]))
+        return Start(best["factor"], best["sharpness"], best["balance"], best["primacy"], best["slope"])
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{record}: expected a list of starts with their losses: {error}") from error
+
+
+def _descend(measure: Callable[[tuple[int, ...]], float], first: Sequence[tuple[int, ...]]) -> None:
+    """Walk a grid downhill from the best of the ``first`` places, an axis at a time, until none leads on."""
+    at = min(first, key=measure)
+    while True:
+        before = at
+        for axis, way in product(range(len(at)), (1, -1)):
+            while True:
+                there = (*at[:axis], at[axis] + way, *at[axis + 1 :])
+                if measure(there) >= measure(at):
+                    break
+                at = there
+        if at == before:
+            return
 
 
 def _loss(loss: float | None) -> float:
