@@ -67,14 +67,7 @@ def as_number(
 
 
 def as_numbers(
-    name: str,
-    values: Any,
-    count: int,
-    what: str,
-    low: float = -math.inf,
-    high: float = math.inf,
-    *,
-    above: bool = False,
+    name: str, values: Any, count: int, what: str, low: float = -math.inf, *, above: bool = False
 ) -> list[float]:
     """As many numbers as there are of something: those given, or one for all of them.
 
@@ -83,7 +76,7 @@ def as_numbers(
         values: a number or a list.
         count: how many.
         what: they must be, for errors: "one number for each memory".
-        low, high, above: of each, see `as_number`.
+        low, above: of each, see `as_number`.
 
     Raises:
         ValueError: more or fewer, none, or one that `as_number` refuses.
@@ -91,7 +84,7 @@ def as_numbers(
     each = list(values) if isinstance(values, list | tuple) else [values] * count
     if len(each) != count or not count:
         raise ValueError(f"{name} must be {what}, got {len(each)} for {count}")
-    return [as_number(name, value, low, high, above=above) for value in each]
+    return [as_number(name, value, low, above=above) for value in each]
 
 
 def as_seconds(dt: Any, like: Tensor) -> Tensor:

@@ -16,8 +16,8 @@ def crps(members: Tensor, target: Tensor, weights: Tensor | None = None, fair: b
 
     sum_j w_j |x_j - y| - sum_jk w_j w_k |x_j - x_k| / (2 (1 - 1 / E)).
 
-    The last divisor is that of E draws also where they have weights. With 2 (1 - sum_j w_j^2), which is fair to weights
-    that do not depend on the members, a filter that chooses its weights gains by putting nearly all on one of them.
+    The last divisor is that of E draws also where they have weights. With 2 (1 - sum_j w_j^2), which is fair to
+    weights that do not depend on the members, a filter that chooses its weights gains by naming one or two of them.
 
     Args:
         members: [..., E, D], E >= 2.
