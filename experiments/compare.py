@@ -20,7 +20,7 @@ import torch
 from experiments import moveint
 from experiments.command_line import add_data_options, add_run_options, command, experiment_parser
 from experiments.data import choose_subsets, load, thinning
-from experiments.entries import METHODS, Fold
+from experiments.entries import ALL, METHODS, WITHOUT, Fold
 from experiments.evaluate import evaluate
 from experiments.figures import horizons_figure, results_figure
 from experiments.folds import LOST, mean_of_cells, read_values, run_folds, share_cores, split, write_values
@@ -68,7 +68,7 @@ def run_fold(job: Job) -> Values:
             began = time.monotonic()
             if fold is None:
                 fold = Fold.of(known, task, job.seed, job.tuning, folder, job.members, job.scan, device)
-            method = METHODS[name](fold)
+            method = ALL[name](fold)
             built = time.monotonic()
             values = {} if method is None else evaluate(task, {name: method}, tests)
             seconds = {"building": round(built - began, 2), "answering": round(time.monotonic() - built, 2)}
@@ -182,8 +182,9 @@ def _parser() -> argparse.ArgumentParser:
     add_data_options(parser)
     parser.add_argument("--folds", type=int, default=10, help="of the cross-validation (default: 10)")
     parser.add_argument(
-        "--methods", nargs="+", choices=list(METHODS), default=list(METHODS), metavar="METHOD",
-        help=f"which to compare (default: all: {', '.join(METHODS)})",
+        "--methods", nargs="+", choices=list(ALL), default=list(METHODS), metavar="METHOD",
+        help=f"which to compare (default: {', '.join(METHODS)}; what each part of the tuned filter gives: "
+        f"{', '.join(WITHOUT)})",
     )  # fmt: skip
     parser.add_argument(
         "--subsets", nargs="+", default=[], metavar="SUBSET",

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -118,8 +119,8 @@ class Fold:
         """The best one on R."""
         return best_factor(self.held_out(), scaled, self.scan, FACTORS, self.folder / "scan_scaled.json")
 
-    def model(self) -> InteractionModel:
-        """What `learn` makes of it."""
+    def model(self, name: str = "ebip_tuned", **options: Any) -> InteractionModel:
+        """What `learn` makes of it, with further options, in a folder of that name."""
         layout, task = self.known.layout, self.task
         settings = {field.name: getattr(self.tuning, field.name) for field in fields(self.tuning)}
         model = learn(
@@ -127,7 +128,7 @@ class Fold:
             targets=task.targets,
             sensors=[name for name in layout.names if name not in task.targets or name in _shown(task)],
             subsets=task.subsets,
-            folder=self.folder / "ebip_tuned",
+            folder=self.folder / name,
             progress=lambda _: None,
             arm=None if task.arm is None else task.arm[0],
             joints=None if task.arm is None else task.arm[1],
@@ -135,7 +136,7 @@ class Fold:
             scan=self.scan,
             members=settings.pop("n_members"),
             ranks=Ranks(device=self.primitive.weights.device),
-            **settings,
+            **(settings | options),
         )
         if model.report["interrupted"]:
             raise KeyboardInterrupt
@@ -214,3 +215,19 @@ METHODS: dict[str, Callable[[Fold], Method | None]] = {
     "ebip_tuned": _filter(lambda fold: fold.model().filter),
 }
 """Builders; one that does not apply to the recordings returns None."""
+
+WITHOUT: dict[str, dict[str, Any]] = {
+    "ebip_tuned_end_alone": {"ahead": (math.inf,)},
+    "ebip_tuned_one_memory": {"memories": 1},
+    "ebip_tuned_not_drawn": {"shrink": False},
+    "ebip_tuned_no_gradient": {"steps": 0},
+}
+"""What `learn` makes without one of its parts, by options of it."""
+
+
+def _without(name: str) -> Callable[[Fold], Method | None]:
+    return _filter(lambda fold: fold.model(name, **WITHOUT[name]).filter)
+
+
+ALL = METHODS | {name: _without(name) for name in WITHOUT}
+"""All that can be asked for."""
