@@ -28,7 +28,7 @@ from torch_ebip import (
     select_basis,
 )
 from torch_ebip.learning.configuration import Task
-from torch_ebip.learning.drawing import learn_drawing
+from torch_ebip.learning.drawing import learn_drawing, remaining_error
 from torch_ebip.learning.held_out import HeldOut
 from torch_ebip.learning.horizons import AHEAD
 from torch_ebip.learning.objective import ForecastObjective
@@ -58,13 +58,19 @@ def test_it_is_the_recipe_step_by_step() -> None:
     factor = best_factor(held_out, scaled, 6, FACTORS)
     start = best_start(held_out, factor, 6)
     filter = tunable(primitive, start)
+    order = torch.cat([held_out.partition.validating, held_out.partition.training])
+    filter.readout = learn_drawing(held_out, filter, order, held_out.partition.validating).readout
     result = Tuner(filter, known, *task, settings).run()
+    assert score(held_out, filter, held_out.partition.validating)["loss"] == pytest.approx(
+        min(result.validation.values()), rel=1e-6
+    )
+    filter.readout = None
     assert model.report["factor"] == factor
     assert model.report["start"] == start._asdict()
     assert model.report["validation"] == {str(step): loss for step, loss in result.validation.items()}
-    losses = {name: scores["loss"] for name, scores in model.report["stages"].items() if "loss" in scores}
-    assert model.report["chosen"] == min(losses, key=losses.get)
-    assert losses["gradient"] == pytest.approx(min(result.validation.values()), rel=1e-6)
+    left = {name: scores["remaining"] for name, scores in model.report["stages"].items() if "remaining" in scores}
+    assert model.report["chosen"] == min(left, key=left.get)
+    assert left["gradient"] == remaining_error(held_out, filter, held_out.partition.validating)
     if model.report["chosen"] in ("start", "gradient"):
         expected = filter if model.report["chosen"] == "gradient" else tunable(primitive, start)
         for name, parameter in expected.named_parameters():
@@ -185,8 +191,8 @@ def test_few_demonstrations_give_a_model_without_a_gradient(count: int) -> None:
     assert f"no gradient: {count} demonstrations are too few" in report.verdict
     assert report["interactions"] == count
     assert set(report["stages"]) == {"mean", "nearest", "closed_form", "factor", "start", "shrinkage"}
-    losses = {name: scores["loss"] for name, scores in report["stages"].items() if "loss" in scores}
-    assert report["chosen"] == min(losses, key=losses.get)
+    left = {name: scores["remaining"] for name, scores in report["stages"].items() if "remaining" in scores}
+    assert report["chosen"] == min(left, key=left.get)
     assert model.forecast(example()[8], [0.5]).mean.isfinite().all()
 
 

@@ -43,7 +43,7 @@ def test_the_start_is_the_best_of_what_was_tried(tmp_path: Path) -> None:
     held_out = HeldOut(made, task, TuningSettings(folds=4, thinning=2))
     start = best_start(held_out, 100.0, 6, record=tmp_path / "scan.json")
     losses = json.loads((tmp_path / "scan.json").read_text())
-    best = min(losses, key=lambda entry: entry["loss"])
+    best = min(losses, key=lambda entry: entry["remaining"])
     assert start == Start(*(best[name] for name in Start._fields))
     tried = [Start(*(entry[name] for name in Start._fields)) for entry in losses]
     assert len(set(tried)) == len(tried) <= TRIES

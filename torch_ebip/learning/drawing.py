@@ -7,6 +7,8 @@ squares, times a trust that grows with the standard errors of its gain over inte
 
 from __future__ import annotations
 
+import math
+from itertools import product
 from typing import NamedTuple
 
 import torch
@@ -121,12 +123,38 @@ def learn_drawing(held_out: HeldOut, filter: InteractionFilter, interactions: Te
     return Drawn(HorizonShrinkage(share, widening, ahead.tolist()), shares, scores_of(after), *gains)
 
 
+@without_autocast
+@torch.no_grad()
+def remaining_error(held_out: HeldOut, filter: InteractionFilter, interactions: Tensor) -> float:
+    """What is left of the training mean's absolute error once forecasts are drawn towards it, 0 to about 1.
+
+    The mean over horizons and target modalities, each with the share that is best by least squares. So filters are
+    told apart by what they know, not by how sure they are of it, which the read-out says after them.
+
+    Args:
+        held_out: the demonstrations, and what is asked of them.
+        filter: without a read-out.
+        interactions: int64 [B].
+    """
+    said, layout = _said(held_out, filter, interactions), held_out.task.primitive.layout
+    modality = layout.modality_of_dof.to(said.towards.device)[held_out.task.targets]
+    left: list[float] = []
+    for m, p in product(sorted(set(modality.tolist())), range(said.towards.shape[2])):
+        wanted, towards = said.wanted[:, :, p, modality == m], said.towards[:, :, p, modality == m]
+        measured = ~wanted.isnan()
+        wanted, towards = wanted[measured].double(), towards[measured].double()
+        if len(wanted) and bool(wanted.any()):
+            share = ((towards @ wanted) / (towards @ towards).clamp(min=1e-12)).clamp(0, 1)
+            left.append(float((wanted - share * towards).abs().mean() / wanted.abs().mean()))
+    return sum(left) / max(len(left), 1)
+
+
 def _said(held_out: HeldOut, filter: InteractionFilter, interactions: Tensor) -> Said:
     """What a filter says of interactions int64 [B], with every set of sensors; of all processes together."""
     task = held_out.task
     primitive, targets, objective = task.primitive, task.targets, task.objective
     scale, ahead = objective.scale, objective.ahead
-    assert ahead is not None
+    seconds = scale.new_tensor([math.inf]) if ahead is None else ahead
     parts: list[Said] = []
     for subset in task.subsets.values():
         for trial in held_out.trials(filter, interactions, subset):
@@ -138,7 +166,7 @@ def _said(held_out: HeldOut, filter: InteractionFilter, interactions: Tensor) ->
             _, variance = trial.filter.demonstrated(lead.phase)
             widths = widths_of(forecast, variance[..., shown.targets])
             level = level_hats(widths, scale.new_tensor(LEVELS))
-            place = horizon_hats(lead, ahead)
+            place = horizon_hats(lead, seconds)
             values = (forecast.mean - mean, shown.truth - mean, widths.own, widths.demonstrated)
             towards, wanted, own, apart = (value / scale for value in values)
             parts.append(Said(shown.interactions, towards, wanted, own, apart, level, place))

@@ -20,7 +20,7 @@ from torch_ebip.interaction.filters import InteractionEnsembleFilter
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.kinematics import RobotArm
 from torch_ebip.learning.configuration import Task
-from torch_ebip.learning.drawing import Drawn, learn_drawing
+from torch_ebip.learning.drawing import Drawn, learn_drawing, remaining_error
 from torch_ebip.learning.groups import labelled
 from torch_ebip.learning.held_out import HeldOut
 from torch_ebip.learning.horizons import horizon_name, reached
@@ -36,15 +36,7 @@ from torch_ebip.learning.recognising import learn_recognition
 from torch_ebip.learning.report import STAGES, Report, verdict_of
 from torch_ebip.learning.settings import TuningSettings
 from torch_ebip.learning.stages import Scores, reference_scores, score
-from torch_ebip.learning.starts import (
-    FACTORS,
-    TRIES,
-    Start,
-    best_factor,
-    best_start,
-    scaled,
-    tunable,
-)
+from torch_ebip.learning.starts import FACTORS, TRIES, Start, best_factor, best_start, scaled, tunable
 from torch_ebip.learning.tuner import Tuner
 from torch_ebip.recordings.demonstrations import Demonstrations
 
@@ -169,7 +161,7 @@ class Procedure:
             interrupted = True
         interrupted = interrupted or self.said.get("interrupted_at") is not None
         names = [name for name in self.filters if self.known.labels is None or name in WEIGHING] or list(self.filters)
-        chosen = min(names, key=lambda name: self.scores[name]["loss"])
+        chosen = min(names, key=lambda name: self.scores[name]["remaining"])
         drawn = None
         if not interrupted:
             try:
@@ -207,6 +199,7 @@ class Procedure:
 
     def _stage(self, name: str, filter: InteractionEnsembleFilter) -> None:
         self.scores[name] = score(self.held_out, filter, self.scored)
+        self.scores[name]["remaining"] = remaining_error(self.held_out, filter, self.scored)
         self.filters[name] = filter
         scores = self.scores
         self.reporter.tick(text=f"{name} {scores[name]['error']:.3f}, mean {scores['mean']['error']:.3f}")
@@ -215,6 +208,8 @@ class Procedure:
         """The gradient, from the best start."""
         self.reporter.stage("gradient")
         filter = tunable(self.primitive, Start(**self.said["start"]), self.members)
+        # What is minimised is what will be said: drawn to the mean and stretched as far as the start should be.
+        filter.readout = self._drawing(filter).readout
         last = 0
 
         def show(step: int, loss: float, validation: float) -> None:
@@ -232,22 +227,26 @@ class Procedure:
             "validation": {str(step): loss for step, loss in result.validation.items()},
             "interrupted_at": result.interrupted_at,
         }
-        self.scores["gradient"] = score(self.held_out, filter, self.scored)
-        self.filters["gradient"] = filter
+        filter.readout = None
+        self._stage("gradient", filter)
 
     def _draw(self, filter: InteractionEnsembleFilter) -> Drawn:
         """How far the forecasts of a filter are drawn towards the mean, and how wide they are."""
         self.reporter.stage("shrinkage")
-        # Those that are scored first: they are the beginning of the order.
-        partition = self.held_out.partition
-        some = torch.cat([partition.validating, partition.training])[: max(MOST, len(self.scored))]
-        drawn = learn_drawing(self.held_out, filter, some, self.scored)
+        drawn = self._drawing(filter)
         if self.shrink:
             filter.readout = drawn.readout
             self.said["shrinkage"] = drawn.shares
             self.scores["shrinkage"] = drawn.scores
         self.reporter.tick()
         return drawn
+
+    def _drawing(self, filter: InteractionEnsembleFilter) -> Drawn:
+        """See `learn_drawing`."""
+        # Those that are scored first: they are the beginning of the order.
+        partition = self.held_out.partition
+        some = torch.cat([partition.validating, partition.training])[: max(MOST, len(self.scored))]
+        return learn_drawing(self.held_out, filter, some, self.scored)
 
     def _recognise(self, filter: InteractionEnsembleFilter) -> None:
         """How sure the filter may be of a label."""

@@ -77,7 +77,7 @@ class Report(Mapping[str, Any]):
 
 
 def _shown(key: str) -> bool:
-    return key in ("loss", "error", "coverage_95") or key.startswith(("error/", "mae/"))
+    return key in ("loss", "remaining", "error", "coverage_95") or key.startswith(("error/", "mae/"))
 
 
 def verdict_of(

@@ -13,7 +13,8 @@ from torch_ebip.learning.references import nearest, paths_after
 
 Scores = dict[str, float]
 """``error``, the root mean squared error over all horizons alike in units of the targets' spread, ``error/HORIZON``,
-``mae/MODALITY`` of the end in its unit and, of filters, ``coverage_95``, ``coverage_95/HORIZON`` and ``loss``."""
+``mae/MODALITY`` of the end in its unit and, of filters, ``coverage_95``, ``coverage_95/HORIZON``, ``loss`` and
+``remaining``, see `remaining_error`: the least of it is chosen."""
 
 
 def score(held_out: HeldOut, filter: InteractionFilter, interactions: Tensor) -> Scores:

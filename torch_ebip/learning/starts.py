@@ -21,6 +21,7 @@ from torch_ebip.interaction.basis.bspline import BSplineBasis
 from torch_ebip.interaction.filters import InteractionEnsembleFilter, InteractionFilter
 from torch_ebip.interaction.presets import ebip
 from torch_ebip.interaction.primitive import InteractionPrimitive
+from torch_ebip.learning.drawing import remaining_error
 from torch_ebip.learning.held_out import HeldOut
 
 FACTORS = (1.0, 10.0, 100.0, 1000.0, 10000.0)
@@ -153,14 +154,14 @@ def best_start(
     tick: Callable[[], None] = lambda: None,
     memories: int = 2,
 ) -> Start:
-    """The start of `tunable` with the smallest loss: the best of a few, and from there downhill, an axis at a time.
+    """The start of `tunable` with the least `remaining_error`: of a few, and from there downhill, an axis at a time.
 
     Args:
         held_out: the demonstrations, and what is asked of them.
         factor: the best one without evidence weights, which take over a part of what a large R is for.
         interactions: how many of them decide.
         members: E of the filter.
-        record: file of the losses, written when all are known; if it exists, its best start is returned.
+        record: file of what remains, written when all are known; if it exists, its best start is returned.
         tick: called `TRIES` times, after each filter that was tried.
         memories: 2, a fast and a slow one; or 1.
 
@@ -172,34 +173,34 @@ def best_start(
         kept: Sequence[tuple[float | None, float]] = MEMORIES if memories == 2 else [(None, 0.0)]
         scales = [float(f"{factor * 10 ** (half / 2):.4g}") for half in range(-4, 3)]
         axes = (scales, SHARPNESSES, kept, SLOPES)
-        losses: dict[tuple[int, ...], float] = {}
+        left_of: dict[tuple[int, ...], float] = {}
 
         def start_at(place: tuple[int, ...]) -> Start:
             """Of a number on each axis."""
             return Start(scales[place[0]], SHARPNESSES[place[1]], *kept[place[2]], SLOPES[place[3]])
 
         def measure(place: tuple[int, ...]) -> float:
-            """The loss of a filter that starts there; once known, or when enough were tried, no other is asked."""
+            """What remains with a filter that starts there; when enough were tried, no other is."""
             inside = all(0 <= i < len(axis) for i, axis in zip(place, axes, strict=True))
-            if inside and place not in losses and len(losses) < TRIES:
+            if inside and place not in left_of and len(left_of) < TRIES:
                 filter = tunable(held_out.task.primitive, start_at(place), members)
-                losses[place] = _loss(held_out.evaluate(filter, order)["loss"])
+                left_of[place] = _loss(remaining_error(held_out, filter, order))
                 tick()
-            return losses.get(place, math.inf)
+            return left_of.get(place, math.inf)
 
         _descend(measure, list(product((2, 4, 6), (2, 4), FIRST if memories == 2 else (0,), (2,))))
-        for _ in range(TRIES - len(losses)):
+        for _ in range(TRIES - len(left_of)):
             tick()
-        known = [{**start_at(place)._asdict(), "loss": loss} for place, loss in losses.items()]
+        known = [{**start_at(place)._asdict(), "remaining": left} for place, left in left_of.items()]
         if record is not None and held_out.ranks.first:
             write_json(record, known)
     else:
         known = read_json(record)
     try:
-        best = min(known, key=lambda entry: _loss(entry["loss"]))
+        best = min(known, key=lambda entry: _loss(entry["remaining"]))
         return Start(best["factor"], best["sharpness"], best["balance"], best["primacy"], best["slope"])
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{record}: expected a list of starts with their losses: {error}") from error
+        raise ValueError(f"{record}: expected a list of starts with what remains of the error: {error}") from error
 
 
 def _descend(measure: Callable[[tuple[int, ...]], float], first: Sequence[tuple[int, ...]]) -> None:
