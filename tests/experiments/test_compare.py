@@ -8,7 +8,7 @@ import pytest
 
 from experiments import compare, computation_time, uncertainty
 from experiments.data import choose_subsets, load
-from experiments.entries import METHODS
+from experiments.entries import METHODS, WITHOUT
 from experiments.paper_table import paper_rows
 from experiments.results import Cell, grids, markdown, summarise
 from tests.conftest import interactions
@@ -57,6 +57,24 @@ def test_the_table_has_every_cell(finished: Path) -> None:
     assert "by seconds ahead**" in text
     assert (finished / "horizons.png").stat().st_size > 10_000
     assert "| `ebip_tuned` |" in text
+
+
+def test_the_tuned_filter_without_its_parts_is_another(recordings: str, tmp_path: Path) -> None:
+    names = list(WITHOUT)
+    few = ["--folds", "2", "--subsets", "hand", "--methods", *names]
+    compare.main(["--data", recordings, "--quick", "--steps", "2", *few, "--out", str(tmp_path / "run")])
+    reports = {name: json.loads((tmp_path / f"run/fold-00/{name}/report.json").read_text()) for name in names}
+    settings = {name: report["settings"] for name, report in reports.items()}
+    assert [settings[name]["memories"] for name in names] == [2, 1, 2, 2]
+    assert [settings[name]["ahead"] == ["end"] for name in names] == [True, False, False, False]
+    assert ["shrinkage" in reports[name] for name in names] == [True, True, False, True]
+    assert ["gradient" in reports[name]["stages"] for name in names] == [True, True, True, False]
+    results = json.loads((tmp_path / "run/results.json").read_text())
+    means = [
+        tuple(row["mean"] for row in results["rows"] if row["method"] == name and row["metric"] == "mae")
+        for name in names
+    ]
+    assert len(set(means)) == len(names)
 
 
 def test_an_interrupted_study_loses_no_finished_method(
