@@ -1,10 +1,14 @@
 """What decides how far a forecast is drawn: numbers made for it, against numpy."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
-from torch_ebip.learning.drawing import CERTAIN, DOUBT, Said, _trust, _widening
+from torch_ebip.learning import Weights, remaining
+from torch_ebip.learning.drawing import CERTAIN, DOUBT, _trust, _widening
+from torch_ebip.learning.said import Said
 
 
 def said(rho: float, n: int = 40, heavy: bool = False) -> Said:
@@ -15,7 +19,7 @@ def said(rho: float, n: int = 40, heavy: bool = False) -> Said:
     towards = torch.tensor(rho * wanted + np.sqrt(1 - rho**2) * noise)
     one = torch.ones(2 * n, 3, 1, 1, dtype=torch.float64)
     interaction = torch.arange(n).repeat_interleave(2)
-    return Said(interaction, towards, torch.tensor(wanted), one, one, one.unsqueeze(-1), one)
+    return Said(interaction, towards, torch.tensor(wanted), one, one, one.unsqueeze(-1), one, one)
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.2, 0.45, 0.9])
@@ -52,3 +56,39 @@ def test_deviations_are_stretched_until_they_hold_what_they_say(heavy: bool) -> 
     for f in range(5):
         others = (miss / width)[fold != f].flatten().numpy()
         assert left_out[fold == f, 0].unique().item() == pytest.approx(np.quantile(others, 0.95) / 1.959964)
+
+
+def test_what_remains_is_what_no_share_of_a_forecast_explains(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By DoF and horizon, of two modalities; and in units of what the mean errs, of a tool beside them."""
+    draws = np.random.default_rng(0)
+    wanted = draws.standard_normal((12, 2, 2, 3)) * np.array([1.0, 2.0, 0.5])
+    wanted[3, :, 1] = np.nan
+    towards = 0.8 * np.nan_to_num(wanted) + 0.4 * draws.standard_normal(wanted.shape)
+    mean, one = draws.standard_normal(wanted.shape), np.ones_like(wanted)
+    tensors = [torch.tensor(of) for of in (towards, wanted, one, one, one[..., None], one, mean)]
+    monkeypatch.setattr(remaining, "what_it_says", lambda *_: Said(torch.arange(12), *tensors))
+    left = []
+    for p in range(2):
+        for dofs in ([0, 1], [2]):
+            w, t = wanted[:, :, p, dofs].ravel(), towards[:, :, p, dofs].ravel()
+            w, t = w[~np.isnan(w)], t[~np.isnan(w)]
+            share = np.clip((t @ w) / (t @ t), 0, 1)
+            left += [np.abs(w - share * t).mean() / np.abs(w).mean()] * len(dofs)
+
+    def held_out(**objective: object) -> SimpleNamespace:
+        modality = torch.tensor([0, 0, 1, 2])
+        layout = SimpleNamespace(modality_of_dof=modality)
+        named = {"arm": None, "joints": None, "weights": Weights(), "scale": torch.full((2, 3), 2.0)} | objective
+        task = SimpleNamespace(
+            primitive=SimpleNamespace(layout=layout), targets=modality < 2, objective=SimpleNamespace(**named)
+        )
+        return SimpleNamespace(task=task)
+
+    alone = remaining.remaining_error(held_out(), None, None)
+    assert alone == pytest.approx(np.mean(left))
+    tool = {"arm": lambda a, b: (a - b).abs().nanmean(), "joints": [2], "weights": Weights(tool=3.0)}
+    w, t = wanted[:, :, 1, 2], towards[:, :, 1, 2]
+    known = ~np.isnan(w)
+    share = np.clip((t[known] @ w[known]) / (t[known] @ t[known]), 0, 1)
+    of_tool = np.abs(w - share * t)[known].mean() / np.abs(w)[known].mean()
+    assert remaining.remaining_error(held_out(**tool), None, None) == pytest.approx((2 * alone + 3 * of_tool) / 5)

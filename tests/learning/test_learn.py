@@ -28,11 +28,12 @@ from torch_ebip import (
     select_basis,
 )
 from torch_ebip.learning.configuration import Task
-from torch_ebip.learning.drawing import learn_drawing, remaining_error
+from torch_ebip.learning.drawing import learn_drawing
 from torch_ebip.learning.held_out import HeldOut
 from torch_ebip.learning.horizons import AHEAD
 from torch_ebip.learning.objective import ForecastObjective
 from torch_ebip.learning.references import nearest
+from torch_ebip.learning.remaining import remaining_error
 from torch_ebip.learning.stages import reference_scores, score
 from torch_ebip.learning.starts import FACTORS, best_factor, best_start, scaled, tunable
 from torch_ebip.recordings import actions, example

@@ -7,20 +7,17 @@ squares, times a trust that grows with the standard errors of its gain over inte
 
 from __future__ import annotations
 
-import math
-from itertools import product
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from torch_ebip.common.ambient import without_autocast
-from torch_ebip.common.brief import brief
 from torch_ebip.interaction.filters import InteractionFilter
-from torch_ebip.interaction.horizons import LEVELS, HorizonShrinkage, horizon_hats, level_hats
-from torch_ebip.interaction.readout import widths_of
+from torch_ebip.interaction.horizons import LEVELS, HorizonShrinkage
 from torch_ebip.learning.held_out import HeldOut
 from torch_ebip.learning.metrics import Z95
+from torch_ebip.learning.said import Said, what_it_says
 from torch_ebip.learning.stages import Scores, scores_of, tally
 
 SWEEPS = 200
@@ -52,30 +49,6 @@ class Drawn(NamedTuple):
     gain_alone: dict[str, float]
 
 
-class Said(NamedTuple):
-    """What a filter said of interactions it did not know: R of them, K moments, P horizons, D targets.
-
-    Attributes:
-        interaction: int64 [R].
-        towards: [R, K, P, D], forecast less the mean, units of the scale.
-        wanted: [R, K, P, D], truth less the mean; NaN: not measured.
-        own, demonstrated: [R, K, P, D], deviations of the forecast and of the demonstrations, units of the scale.
-        level: [R, K, P, D, J], see `level_hats`.
-        place: [R, K, P, S], see `horizon_hats`.
-    """
-
-    interaction: Tensor
-    towards: Tensor
-    wanted: Tensor
-    own: Tensor
-    demonstrated: Tensor
-    level: Tensor
-    place: Tensor
-
-    def __repr__(self) -> str:
-        return brief(self)
-
-
 @without_autocast
 @torch.no_grad()
 def learn_drawing(held_out: HeldOut, filter: InteractionFilter, interactions: Tensor, scored: Tensor) -> Drawn:
@@ -94,7 +67,7 @@ def learn_drawing(held_out: HeldOut, filter: InteractionFilter, interactions: Te
     names, ahead = objective.horizons, objective.ahead
     assert names is not None
     assert ahead is not None
-    said = _said(held_out, filter, interactions)
+    said = what_it_says(held_out, filter, interactions)
     device = said.towards.device
     fold = held_out.partition.fold_of.to(device)[said.interaction]
     modality = layout.modality_of_dof.to(device)[task.targets]
@@ -123,63 +96,10 @@ def learn_drawing(held_out: HeldOut, filter: InteractionFilter, interactions: Te
     return Drawn(HorizonShrinkage(share, widening, ahead.tolist()), shares, scores_of(after), *gains)
 
 
-@without_autocast
-@torch.no_grad()
-def remaining_error(held_out: HeldOut, filter: InteractionFilter, interactions: Tensor) -> float:
-    """What is left of the training mean's absolute error once forecasts are drawn towards it, 0 to about 1.
-
-    The mean over horizons and target modalities, each with the share that is best by least squares. So filters are
-    told apart by what they know, not by how sure they are of it, which the read-out says after them.
-
-    Args:
-        held_out: the demonstrations, and what is asked of them.
-        filter: without a read-out.
-        interactions: int64 [B].
-    """
-    said, layout = _said(held_out, filter, interactions), held_out.task.primitive.layout
-    modality = layout.modality_of_dof.to(said.towards.device)[held_out.task.targets]
-    left: list[float] = []
-    for m, p in product(sorted(set(modality.tolist())), range(said.towards.shape[2])):
-        wanted, towards = said.wanted[:, :, p, modality == m], said.towards[:, :, p, modality == m]
-        measured = ~wanted.isnan()
-        wanted, towards = wanted[measured].double(), towards[measured].double()
-        if len(wanted) and bool(wanted.any()):
-            share = ((towards @ wanted) / (towards @ towards).clamp(min=1e-12)).clamp(0, 1)
-            left.append(float((wanted - share * towards).abs().mean() / wanted.abs().mean()))
-    return sum(left) / max(len(left), 1)
-
-
-def _said(held_out: HeldOut, filter: InteractionFilter, interactions: Tensor) -> Said:
-    """What a filter says of interactions int64 [B], with every set of sensors; of all processes together."""
-    task = held_out.task
-    primitive, targets, objective = task.primitive, task.targets, task.objective
-    scale, ahead = objective.scale, objective.ahead
-    seconds = scale.new_tensor([math.inf]) if ahead is None else ahead
-    parts: list[Said] = []
-    for subset in task.subsets.values():
-        for trial in held_out.trials(filter, interactions, subset):
-            shown, state = trial.shown, trial.trace.kept
-            forecast = trial.forecast(objective)
-            lead = trial.filter.lead(state, forecast.phase, ahead)
-            weights = primitive.weights[shown.members].mean(1)[:, None, None, :]
-            mean = primitive.basis.project(lead.phase, weights)[..., targets]
-            _, variance = trial.filter.demonstrated(lead.phase)
-            widths = widths_of(forecast, variance[..., shown.targets])
-            level = level_hats(widths, scale.new_tensor(LEVELS))
-            place = horizon_hats(lead, seconds)
-            values = (forecast.mean - mean, shown.truth - mean, widths.own, widths.demonstrated)
-            towards, wanted, own, apart = (value / scale for value in values)
-            parts.append(Said(shown.interactions, towards, wanted, own, apart, level, place))
-    shares = held_out.ranks.gather([[tensor.cpu() for tensor in part] for part in parts])
-    together = [part for share in shares for part in share]
-    device = primitive.weights.device
-    return Said(*(torch.cat(tensors).to(device) for tensors in zip(*together, strict=True)))
-
-
 def _of(said: Said, ours: Tensor) -> Said:
     """Of some of the targets, bool [D]."""
     towards, wanted, own, apart, level = (tensor[:, :, :, ours] for tensor in said[1:6])
-    return Said(said.interaction, towards, wanted, own, apart, level, said.place)
+    return Said(said.interaction, towards, wanted, own, apart, level, said.place, said.mean[:, :, :, ours])
 
 
 def _best_shares(part: Said, fold: Tensor, folds: int, pull: float) -> tuple[Tensor, Tensor]:

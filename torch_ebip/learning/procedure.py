@@ -20,7 +20,7 @@ from torch_ebip.interaction.filters import InteractionEnsembleFilter
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.kinematics import RobotArm
 from torch_ebip.learning.configuration import Task
-from torch_ebip.learning.drawing import Drawn, learn_drawing, remaining_error
+from torch_ebip.learning.drawing import Drawn, learn_drawing
 from torch_ebip.learning.groups import labelled
 from torch_ebip.learning.held_out import HeldOut
 from torch_ebip.learning.horizons import horizon_name, reached
@@ -33,6 +33,7 @@ from torch_ebip.learning.place import enter, fingerprint
 from torch_ebip.learning.progress import Reporter
 from torch_ebip.learning.ranks import Ranks
 from torch_ebip.learning.recognising import learn_recognition
+from torch_ebip.learning.remaining import remaining_error
 from torch_ebip.learning.report import STAGES, Report, verdict_of
 from torch_ebip.learning.settings import TuningSettings
 from torch_ebip.learning.stages import Scores, reference_scores, score

@@ -21,8 +21,8 @@ from torch_ebip.interaction.basis.bspline import BSplineBasis
 from torch_ebip.interaction.filters import InteractionEnsembleFilter, InteractionFilter
 from torch_ebip.interaction.presets import ebip
 from torch_ebip.interaction.primitive import InteractionPrimitive
-from torch_ebip.learning.drawing import remaining_error
 from torch_ebip.learning.held_out import HeldOut
+from torch_ebip.learning.remaining import remaining_error
 
 FACTORS = (1.0, 10.0, 100.0, 1000.0, 10000.0)
 """Coarse grid of factors on the closed-form R; the best one is refined by half-decades."""

@@ -1,0 +1,68 @@
+"""What a filter says of interactions that it does not know, beside the training mean and the truth."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_ebip.common.brief import brief
+from torch_ebip.interaction.filters import InteractionFilter
+from torch_ebip.interaction.horizons import LEVELS, horizon_hats, level_hats
+from torch_ebip.interaction.readout import widths_of
+from torch_ebip.learning.held_out import HeldOut
+
+
+class Said(NamedTuple):
+    """What a filter said of interactions it did not know: R of them, K moments, P horizons, D targets.
+
+    Attributes:
+        interaction: int64 [R].
+        towards: [R, K, P, D], forecast less the mean, units of the scale.
+        wanted: [R, K, P, D], truth less the mean; NaN: not measured.
+        own, demonstrated: [R, K, P, D], deviations of the forecast and of the demonstrations, units of the scale.
+        level: [R, K, P, D, J], see `level_hats`.
+        place: [R, K, P, S], see `horizon_hats`.
+        mean: [R, K, P, D], of the demonstrations, units of the scale.
+    """
+
+    interaction: Tensor
+    towards: Tensor
+    wanted: Tensor
+    own: Tensor
+    demonstrated: Tensor
+    level: Tensor
+    place: Tensor
+    mean: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self)
+
+
+def what_it_says(held_out: HeldOut, filter: InteractionFilter, interactions: Tensor) -> Said:
+    """What a filter says of interactions int64 [B], with every set of sensors; of all processes together."""
+    task = held_out.task
+    primitive, targets, objective = task.primitive, task.targets, task.objective
+    scale, ahead = objective.scale, objective.ahead
+    seconds = scale.new_tensor([math.inf]) if ahead is None else ahead
+    parts: list[Said] = []
+    for subset in task.subsets.values():
+        for trial in held_out.trials(filter, interactions, subset):
+            shown, state = trial.shown, trial.trace.kept
+            forecast = trial.forecast(objective)
+            lead = trial.filter.lead(state, forecast.phase, ahead)
+            weights = primitive.weights[shown.members].mean(1)[:, None, None, :]
+            mean = primitive.basis.project(lead.phase, weights)[..., targets]
+            _, variance = trial.filter.demonstrated(lead.phase)
+            widths = widths_of(forecast, variance[..., shown.targets])
+            level = level_hats(widths, scale.new_tensor(LEVELS))
+            place = horizon_hats(lead, seconds)
+            values = (forecast.mean - mean, shown.truth - mean, widths.own, widths.demonstrated)
+            towards, wanted, own, apart = (value / scale for value in values)
+            parts.append(Said(shown.interactions, towards, wanted, own, apart, level, place, mean / scale))
+    shares = held_out.ranks.gather([[tensor.cpu() for tensor in part] for part in parts])
+    together = [part for share in shares for part in share]
+    device = primitive.weights.device
+    return Said(*(torch.cat(tensors).to(device) for tensors in zip(*together, strict=True)))
