@@ -265,6 +265,15 @@ def test_progress_counts_to_the_end_and_never_back() -> None:
     assert any("validation" in progress.text for progress in seen)
 
 
+@pytest.fixture
+def interruptible():
+    """Ctrl-C interrupts, also where these tests are a background job of a shell, which ignores it."""
+    former = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, former)
+
+
+@pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize("stage", ["factor", "gradient", "shrinkage"])
 def test_an_interrupt_keeps_the_best_so_far(stage: str, tmp_path: Path) -> None:
     """A signal as Ctrl-C sends it, in the middle of a stage; the folder then goes on to what a whole run gives."""
