@@ -129,7 +129,7 @@ class EvidenceWeighting(Weighting):
         offsets: Sequence[float] = (-0.1, -0.05, 0.0, 0.05, 0.1),
     ) -> None:
         super().__init__()
-        count = 1 if isinstance(forgetting, int | float) else len(forgetting)
+        count = len(forgetting) if isinstance(forgetting, list | tuple) else 1
         what = "one number for each memory"
         sharp = as_numbers("sharpness", sharpness, count, what, 0, above=True)
         rates = as_numbers("forgetting", forgetting, count, what, 0, above=True)

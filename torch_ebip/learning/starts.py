@@ -27,7 +27,7 @@ from torch_ebip.learning.remaining import remaining_error
 FACTORS = (1.0, 10.0, 100.0, 1000.0, 10000.0)
 """Coarse grid of factors on the closed-form R; the best one is refined by half-decades."""
 SHARPNESSES = (1.0, 3.16, 10.0, 31.6, 100.0)
-"""Of the evidence weights. With more of it one member speaks, and no gradient leads away from that."""
+"""Of the evidence weights. With more of it one or two members speak for all."""
 FORGETTING = (6.0, 0.01)
 """Rates of the memories, 1/s: a sixth of a second, and the whole interaction."""
 MEMORIES = ((0.95, 0.0), (0.5, 0.0), (0.05, 0.0), (0.05, 4.0), (0.05, 8.0))
