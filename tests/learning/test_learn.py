@@ -46,10 +46,11 @@ def model():
     return learn(interactions(20), **QUICK)
 
 
-def test_it_is_the_recipe_step_by_step() -> None:
+@pytest.mark.parametrize("shrink", [True, False])
+def test_it_is_the_recipe_step_by_step(shrink: bool) -> None:
     """Written out again with the parts that it is made of."""
     known = interactions(20)
-    model = learn(known, shrink=False, **QUICK)
+    model = learn(known, shrink=shrink, **QUICK)
     primitive = InteractionPrimitive.fit(known, select_basis(known))
     targets = known.layout.controlled
     task = Task(primitive, ForecastObjective(primitive, targets, ahead=AHEAD), targets, {"all": ~targets})
@@ -60,7 +61,8 @@ def test_it_is_the_recipe_step_by_step() -> None:
     start = best_start(held_out, factor, 6)
     filter = tunable(primitive, start)
     order = torch.cat([held_out.partition.validating, held_out.partition.training])
-    filter.readout = learn_drawing(held_out, filter, order, held_out.partition.validating).readout
+    if shrink:
+        filter.readout = learn_drawing(held_out, filter, order, held_out.partition.validating).readout
     result = Tuner(filter, known, *task, settings).run()
     assert score(held_out, filter, held_out.partition.validating)["loss"] == pytest.approx(
         min(result.validation.values()), rel=1e-6

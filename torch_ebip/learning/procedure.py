@@ -209,8 +209,9 @@ class Procedure:
         """The gradient, from the best start."""
         self.reporter.stage("gradient")
         filter = tunable(self.primitive, Start(**self.said["start"]), self.members)
-        # What is minimised is what will be said: drawn to the mean and stretched as far as the start should be.
-        filter.readout = self._drawing(filter).readout
+        if self.shrink:
+            # What is minimised is what will be said: drawn to the mean and stretched as far as the start should be.
+            filter.readout = self._drawing(filter).readout
         last = 0
 
         def show(step: int, loss: float, validation: float) -> None:
