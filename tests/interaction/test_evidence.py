@@ -175,3 +175,10 @@ def test_a_sharpness_for_each_memory_is_asked_for() -> None:
         weighting(forgetting=[6.0, 0.1], slope=[1.0])
     with pytest.raises(ValueError, match="relative must be a finite number"):
         weighting(relative=float("nan"))
+
+
+def test_numbers_of_memories_may_be_any_sequence() -> None:
+    for rates in ([6.0, 0.1], (6.0, 0.1), np.array([6.0, 0.1]), torch.tensor([6.0, 0.1])):
+        module = weighting(sharpness=rates, forgetting=rates)
+        assert module.sharpness.value.tolist() == pytest.approx([6.0, 0.1])
+    assert weighting(forgetting=np.float32(2.0)).forgetting.value.tolist() == [2.0]

@@ -429,3 +429,15 @@ def test_groups_that_nobody_named_are_found_and_grow() -> None:
     one = learn(made.subset(range(20)), **QUICK)
     assert one.report["groups"] == {}
     assert one.labels is None
+
+
+def test_a_channel_that_is_always_zero_is_learned_around() -> None:
+    """The spread of the demonstrations is 0 there, and its root has no gradient."""
+    made = example().subset(range(12))
+    paths = [path.clone() for path in made]
+    for path in paths:
+        path[:, 1] = 0.0
+    known = Demonstrations(made.layout, paths, made.rate)
+    model = learn(known, sensors=["hand"], scan=6, steps=2, batch_size=4)
+    assert "gradient" in model.report["stages"]
+    assert model.forecast(model.prepare(known)[0], [0.1, math.inf]).mean.isfinite().all()

@@ -73,7 +73,7 @@ def as_numbers(
 
     Args:
         name: of the argument, for errors.
-        values: a number or a list.
+        values: a number, or a sequence or array of them.
         count: how many.
         what: they must be, for errors: "one number for each memory".
         low, above: of each, see `as_number`.
@@ -81,7 +81,7 @@ def as_numbers(
     Raises:
         ValueError: more or fewer, none, or one that `as_number` refuses.
     """
-    each = list(values) if isinstance(values, list | tuple) else [values] * count
+    each = list(values) if np.ndim(values) else [values] * count
     if len(each) != count or not count:
         raise ValueError(f"{name} must be {what}, got {len(each)} for {count}")
     return [as_number(name, value, low, above=above) for value in each]

@@ -19,7 +19,7 @@ their own, a fast and a slow one; how much each counts is learned.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Sized
 from typing import NamedTuple
 
 import torch
@@ -129,7 +129,7 @@ class EvidenceWeighting(Weighting):
         offsets: Sequence[float] = (-0.1, -0.05, 0.0, 0.05, 0.1),
     ) -> None:
         super().__init__()
-        count = len(forgetting) if isinstance(forgetting, list | tuple) else 1
+        count = len(forgetting) if isinstance(forgetting, Sized) else 1
         what = "one number for each memory"
         sharp = as_numbers("sharpness", sharpness, count, what, 0, above=True)
         rates = as_numbers("forgetting", forgetting, count, what, 0, above=True)

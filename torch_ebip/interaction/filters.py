@@ -107,7 +107,8 @@ class InteractionFilter(Filter):
             state: of this filter.
             phase: [P] or [..., P], or one number; default: 50 phases evenly from the current one to 1.
             ahead: instead of phases: seconds, [P] or one number, each member at its own velocity, backwards none;
-                infinity, and what lies behind the end, is the end. `Forecast.phase` is then the mean of the members'.
+                infinity is the end, behind which nothing lies. `Forecast.phase` is then the mean of the members'. A
+                read-out with a share for the end takes it for infinity, and towards phase 1 where phases are asked.
 
         Raises:
             ValueError: phases that are NaN or infinite; seconds that are NaN or negative; both.

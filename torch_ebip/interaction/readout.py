@@ -91,7 +91,10 @@ def hats(lead: Tensor, leads: Tensor) -> Tensor:
 def widths_of(forecast: Forecast, variance: Tensor) -> Widths:
     """Deviations of a forecast and of the demonstrations, whose ``variance`` is [..., P, D] in squared units."""
     least = torch.finfo(variance.dtype).tiny
-    return Widths(forecast.variance.clamp(min=least).sqrt(), variance.clamp(min=0).sqrt())
+    # The root of 0 has no gradient, and one that is infinite would make those of all parameters NaN.
+    apart = variance > 0
+    demonstrated = torch.where(apart, torch.where(apart, variance, 1).sqrt(), 0)
+    return Widths(forecast.variance.clamp(min=least).sqrt(), demonstrated)
 
 
 def moved(forecast: Forecast, mean: Tensor, deviation: Tensor, share: Tensor, widths: Widths) -> Forecast:

@@ -50,6 +50,7 @@ class DemonstrationTable(nn.Module):
                 f"{list(slopes.shape)}"
             )
         self._parts: OrderedDict[tuple[int, ...], tuple[Tensor, int, Tensor]] = OrderedDict()
+        self._spread: tuple[Tensor, int | None, Tensor] | None = None
         step = 1 / (values.shape[1] - 1)
         first, last = values[:, :-1], values[:, 1:]
         start, end, rise = slopes[:, :-1] * step, slopes[:, 1:] * step, last - first
@@ -99,9 +100,12 @@ class DemonstrationTable(nn.Module):
 
     def spread(self, dofs: Tensor | None = None) -> Tensor:
         """Variance over the demonstrations at the phases of the grid, [P, k], squared units, of DoFs int64 [k]."""
-        cells = self.cells if dofs is None else self.cells[..., dofs]
-        ends = torch.cat([cells[:, :, 0], cells[:, -1:].sum(2)], 1)
-        return ends.var(0, correction=1 if len(ends) > 1 else 0)
+        version = None if self.cells.is_inference() else self.cells._version
+        if self._spread is None or version is None or self._spread[0] is not self.cells or self._spread[1] != version:
+            ends = torch.cat([self.cells[:, :, 0], self.cells[:, -1:].sum(2)], 1)
+            self._spread = self.cells, version, ends.var(0, correction=1 if len(ends) > 1 else 0)
+        spread = self._spread[2]
+        return spread if dofs is None else spread[:, dofs]
 
     def _part(self, dofs: Tensor) -> Tensor:
         """The cells of some DoFs, int64 [k]; those asked for lately are kept while the table is the same."""
@@ -119,13 +123,14 @@ class DemonstrationTable(nn.Module):
 
     def __getstate__(self) -> dict[str, Any]:
         """Copies and pickles have nothing kept: versions of tensors begin anew in them."""
-        return {**self.__dict__, "_parts": OrderedDict()}
+        return {**self.__dict__, "_parts": OrderedDict(), "_spread": None}
 
     def select(self, view: View) -> DemonstrationTable:
         """The table of a view of the model: of its DoFs."""
         part = DemonstrationTable.__new__(DemonstrationTable)
         nn.Module.__init__(part)
         part._parts = OrderedDict()
+        part._spread = None
         part.register_buffer("cells", self.cells[..., view.dofs])
         return part
 

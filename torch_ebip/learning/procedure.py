@@ -41,6 +41,7 @@ from torch_ebip.learning.starts import FACTORS, TRIES, Start, best_factor, best_
 from torch_ebip.learning.tuner import Tuner
 from torch_ebip.recordings.demonstrations import Demonstrations
 
+PROCEDURE = 2  # what another edition of this file began in a folder is not gone on with
 FEWEST = 10
 """Demonstrations below which there is no gradient: those kept for validation would say nothing."""
 MOST = 100
@@ -122,6 +123,7 @@ class Procedure:
         """Everything on which the result depends, as JSON gives it back."""
         objective = self.task.objective
         return {
+            "procedure": PROCEDURE,
             "columns": self.primitive.meant(),
             "demonstrations": len(self.known),
             "values": fingerprint(self.known),
@@ -209,8 +211,7 @@ class Procedure:
         """The gradient, from the best start."""
         self.reporter.stage("gradient")
         filter = tunable(self.primitive, Start(**self.said["start"]), self.members)
-        if self.shrink:
-            # What is minimised is what will be said: drawn to the mean and stretched as far as the start should be.
+        if self.shrink:  # What is minimised is what will be said.
             filter.readout = self._drawing(filter).readout
         last = 0
 

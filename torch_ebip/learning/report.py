@@ -21,11 +21,11 @@ NEITHER = "no better than the training mean, as far as so many tell"
 class Report(Mapping[str, Any]):
     """What `learn` says of a model. It is read like a dictionary, printed as a table, and cannot be changed.
 
-    Entries, as far as there is something to say: ``verdict``, ``stages`` (scores by stage: see `STAGES`), ``chosen``
-    (the stage whose filter the model has), ``interactions`` (how many were left out to score them),
-    ``demonstrations``, ``factor``, ``start``, ``validation`` (loss by step), ``best_step``, ``stopped_early``,
-    ``shrinkage`` (mean shares by target and horizon), ``horizons``, ``remarks`` (what was left out, and why),
-    ``basis``, ``settings``, ``versions``, ``seconds``.
+    Entries, as far as there is something to say: ``verdict``, ``stages`` (scores by stage, of filters before their
+    read-out: see `STAGES`), ``chosen`` (the stage whose filter the model has), ``interactions`` (how many were left
+    out to score them), ``demonstrations``, ``factor``, ``start``, ``validation`` (loss by step, after the read-out),
+    ``best_step``, ``stopped_early``, ``shrinkage`` (mean shares by target and horizon), ``horizons``, ``remarks``
+    (what was left out, and why), ``basis``, ``settings``, ``versions``, ``seconds``.
 
     Args:
         content: plain values.
