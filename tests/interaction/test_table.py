@@ -70,3 +70,13 @@ def test_what_is_kept_follows_the_table() -> None:
     torch.testing.assert_close(other.at(which, phase.double(), dofs), before.double())
     with pytest.raises(ValueError, match="with at least 2 phases"):
         DemonstrationTable(torch.zeros(3, 1, 2), torch.zeros(3, 1, 2))
+
+
+def test_what_is_kept_from_inference_mode_can_be_differentiated_through() -> None:
+    table, dofs = DemonstrationTable.of(small_primitive()), torch.tensor([1, 3])
+    which, phase = torch.arange(24), torch.full((24, 1), 0.4, requires_grad=True)
+    with torch.inference_mode():
+        table.spread(), table.at(which, torch.full((24, 1), 0.4), dofs)
+    (table.spread(dofs).pow(phase.mean()).sum() + table.at(which, phase, dofs).square().sum()).backward()
+    assert phase.grad is not None
+    assert bool(phase.grad.isfinite().all())

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torch_ebip.common.ambient import owned
+from torch_ebip.common.ambient import outside_inference, owned
 from torch_ebip.filtering.protocols import View
 from torch_ebip.interaction.primitive import InteractionPrimitive
 
@@ -104,7 +104,7 @@ class DemonstrationTable(nn.Module):
         if self._spread is None or version is None or self._spread[0] is not self.cells or self._spread[1] != version:
             ends = torch.cat([self.cells[:, :, 0], self.cells[:, -1:].sum(2)], 1)
             self._spread = self.cells, version, ends.var(0, correction=1 if len(ends) > 1 else 0)
-        spread = self._spread[2]
+        spread = outside_inference(self._spread[2])
         return spread if dofs is None else spread[:, dofs]
 
     def _part(self, dofs: Tensor) -> Tensor:
@@ -119,7 +119,7 @@ class DemonstrationTable(nn.Module):
             if len(self._parts) > KEPT:
                 self._parts.popitem(last=False)
         self._parts.move_to_end(key)
-        return part
+        return outside_inference(part)
 
     def __getstate__(self) -> dict[str, Any]:
         """Copies and pickles have nothing kept: versions of tensors begin anew in them."""
