@@ -19,7 +19,7 @@ def said(rho: float, n: int = 40, heavy: bool = False) -> Said:
     towards = torch.tensor(rho * wanted + np.sqrt(1 - rho**2) * noise)
     one = torch.ones(2 * n, 3, 1, 1, dtype=torch.float64)
     interaction = torch.arange(n).repeat_interleave(2)
-    return Said(interaction, towards, torch.tensor(wanted), one, one, one.unsqueeze(-1), one, one)
+    return Said(interaction, towards, torch.tensor(wanted), one, one, one.unsqueeze(-1), one, one, one[..., 0, 0])
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.2, 0.45, 0.9])
@@ -65,7 +65,7 @@ def test_what_remains_is_what_no_share_of_a_forecast_explains(monkeypatch: pytes
     wanted[3, :, 1] = np.nan
     towards = 0.8 * np.nan_to_num(wanted) + 0.4 * draws.standard_normal(wanted.shape)
     mean, one = draws.standard_normal(wanted.shape), np.ones_like(wanted)
-    tensors = [torch.tensor(of) for of in (towards, wanted, one, one, one[..., None], one, mean)]
+    tensors = [torch.tensor(of) for of in (towards, wanted, one, one, one[..., None], one, mean, one[..., 0, 0])]
     monkeypatch.setattr(remaining, "what_it_says", lambda *_: Said(torch.arange(12), *tensors))
     left = []
     for p in range(2):

@@ -262,7 +262,7 @@ def test_progress_counts_to_the_end_and_never_back() -> None:
     assert done == sorted(done)
     assert seen[-1].done == seen[-1].total
     assert [*dict.fromkeys(progress.stage for progress in seen)] == [
-        "closed form", "factor", "start", "gradient", "shrinkage"
+        "closed form", "factor", "start", "gradient", "shrinkage", "surprise"
     ]  # fmt: skip
     assert any("validation" in progress.text for progress in seen)
 
@@ -276,7 +276,7 @@ def interruptible():
 
 
 @pytest.mark.usefixtures("interruptible")
-@pytest.mark.parametrize("stage", ["factor", "gradient", "shrinkage"])
+@pytest.mark.parametrize("stage", ["factor", "gradient", "shrinkage", "surprise"])
 def test_an_interrupt_keeps_the_best_so_far(stage: str, tmp_path: Path) -> None:
     """A signal as Ctrl-C sends it, in the middle of a stage; the folder then goes on to what a whole run gives."""
     known = interactions(20)

@@ -17,7 +17,7 @@ from torch_ebip.common.modules import sharing
 from torch_ebip.filtering.checks import as_sample, check_sequence, usable
 from torch_ebip.filtering.model import StateSpace
 from torch_ebip.filtering.protocols import Narrows, View
-from torch_ebip.filtering.sequence import filter_step_by_step
+from torch_ebip.filtering.sequence import Filtered, filter_step_by_step
 from torch_ebip.filtering.states import State
 from torch_ebip.filtering.trace import Trace
 
@@ -252,15 +252,18 @@ class Filter(Meaning, ABC):
         if engine not in ("auto", "dense", "span"):
             raise ValueError(f'engine must be "auto", "dense" or "span", got {engine!r}')
         if engine != "dense":
-            done = self._through_span(y, observed, dt, state, generator, keep, project)
-            if isinstance(done, Trace):
-                return done
+            trace = self._through_span(y, observed, dt, state, generator, keep, project)
+            if isinstance(trace, Trace):
+                return trace
             if engine == "span":
-                raise ValueError(f'engine="span" cannot serve this: {done}')
+                raise ValueError(f'engine="span" cannot serve this: {trace}')
 
-        return self._trace(
-            *filter_step_by_step(self, y, observed, step, state, generator, keep, segment, project), "dense"
-        )
+        done = filter_step_by_step(self, y, observed, step, state, generator, keep, segment, project)
+        return self._traced(done, "dense")
+
+    def _traced(self, done: Filtered, engine: str) -> Trace:
+        """The trace of a sequence that was filtered by an engine."""
+        return self._trace(*done[:5], engine)
 
     if TYPE_CHECKING:  # what `nn.Module.__call__` hides
 

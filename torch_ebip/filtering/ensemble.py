@@ -14,6 +14,7 @@ from torch_ebip.filtering.in_place import filter_in_place
 from torch_ebip.filtering.members import MemberFilter, NumbersItsStates
 from torch_ebip.filtering.model import StateSpace
 from torch_ebip.filtering.protocols import View
+from torch_ebip.filtering.sequence import Filtered
 from torch_ebip.filtering.states import EnsembleState
 from torch_ebip.filtering.trace import Trace
 from torch_ebip.filtering.updates.update import Update, analyse
@@ -129,7 +130,14 @@ class EnsembleFilter(MemberFilter):
             return reason
         seconds = self.dt if dt is None else float(dt)
         done = filter_in_place(self.model, self.analysis, y, observed, seconds, state, generator, keep, project)
-        return self._trace(*done, "span")
+        return self._traced(done, "span")
+
+    def _traced(self, done: Filtered, engine: str) -> Trace:
+        """See `Filter._traced`."""
+        surprise, felt = self.analysis.surprise, done.felt
+        if surprise is None or felt is None:
+            return super()._traced(done, engine)
+        return self._trace(*done[:5], engine, surprise.familiarity(felt), felt.level, felt.counts)
 
     def _parts(self) -> list[str]:
         """See `Filter._parts`."""

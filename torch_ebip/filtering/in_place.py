@@ -8,7 +8,7 @@ from torch import Tensor
 from torch_ebip.common.draws import Generators
 from torch_ebip.filtering.carriers.span import SpanCarrier
 from torch_ebip.filtering.model import StateSpace
-from torch_ebip.filtering.sequence import assemble
+from torch_ebip.filtering.sequence import Filtered, along, assemble
 from torch_ebip.filtering.states import EnsembleState, State
 from torch_ebip.filtering.updates.update import Update
 
@@ -23,7 +23,7 @@ def filter_in_place(
     generator: Generators,
     keep: Tensor | None,
     project: bool,
-) -> tuple[EnsembleState, Tensor, Tensor, Tensor, State | None]:
+) -> Filtered:
     """`Filter.forward` for sequences y [T, D] or [B, T, D] that were checked; the same numbers up to rounding.
 
     Args:
@@ -37,7 +37,7 @@ def filter_in_place(
         project: whether to project.
 
     Returns:
-        State, states [..., T, m], log-likelihood [..., T], projection [..., T, D] and kept of a `Trace`.
+        See `Filtered`: states [..., T, m], log-likelihood [..., T], projection [..., T, D].
     """
     batch, length, D = y.shape[:-2], y.shape[-2], y.shape[-1]
     ever = observed.reshape(-1, D).any(0)
@@ -47,7 +47,7 @@ def filter_in_place(
     carrier = SpanCarrier(model, update, sensors, state, generator)
     some = observed.reshape(-1, length, D).any(0)
     ragged = (observed != some).any(-1).reshape(-1, length).any(0).tolist()
-    states, likelihoods, projections = [], [], []
+    states, likelihoods, projections, felt = [], [], [], []
     kept: list[tuple[tuple[int, ...], State]] = []
     for t, measured in enumerate(some.tolist()):
         if t:
@@ -56,13 +56,16 @@ def filter_in_place(
         likelihoods.append(carrier.take(y[..., t, :], tuple(measured), mask))
         states.append(carrier.mean)
         projections.append(carrier.project(everything) if project else y.new_zeros(*batch, 0))
+        if carrier.memory.surprise is not None:
+            felt.append(carrier.memory.surprise)
         if keep is not None:
             for place in (keep == t).nonzero().tolist():
                 kept.append((tuple(place), carrier.state(entry=place[0] if batch else None)))
-    return (
+    return Filtered(
         carrier.state(),
         torch.stack(states, -2),
         torch.stack(likelihoods, -1),
         torch.stack(projections, -2),
         None if keep is None else assemble(kept, keep.shape),
+        along(felt, batch),
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -30,16 +30,58 @@ class Steps(Protocol):
 
 
 class Segment(NamedTuple):
-    """What some samples leave: the state after the last one, and an entry a sample: [..., m], [...] and [..., D]."""
+    """What some samples leave: the state after the last one, and an entry a sample: [..., m], [...] and [..., D].
+
+    ``felt`` has what the update's `Surprise` remembered after each sample, nothing where there is none.
+    """
 
     state: State
     states: list[Tensor]
     log_likelihood: list[Tensor]
     projection: list[Tensor]
     kept: list[tuple[tuple[int, ...], State]]
+    felt: list[Any]
 
     def __repr__(self) -> str:
         return brief(self)
+
+
+class Filtered(NamedTuple):
+    """What filtering a sequence gives: the parts of a `Trace`.
+
+    Attributes:
+        state, states, log_likelihood, projection, kept: see `Trace`.
+        felt: what the update's `Surprise` remembered after each sample, [..., T, ...] each; None where there is none.
+    """
+
+    state: State
+    states: Tensor
+    log_likelihood: Tensor
+    projection: Tensor
+    kept: State | None
+    felt: Any = None
+
+    def __repr__(self) -> str:
+        return brief(self)
+
+
+def surprise_of(state: State) -> Any:
+    """What the update's `Surprise` remembers in a state, None if it has none."""
+    memory = getattr(state, "memory", None)
+    return None if memory is None else memory.surprise
+
+
+def along(felt: list[Any], batch: torch.Size) -> Any:
+    """Memories of samples one after the other, together: [*batch, T, ...]; None for none."""
+    if not felt:
+        return None
+    place = len(batch)
+
+    def together(*parts: Tensor) -> Tensor:
+        """All samples of one tensor."""
+        return torch.stack([part.expand((*batch, *part.shape[place:])) for part in parts], place)
+
+    return map_state(together, *felt)
 
 
 def checkpointed(run: Callable[..., Segment], state: State, start: int, stop: int, generator: Generators) -> Segment:
@@ -98,7 +140,7 @@ def filter_step_by_step(
     keep: Tensor | None,
     segment: int | None,
     project: bool,
-) -> tuple[State, Tensor, Tensor, Tensor, State | None]:
+) -> Filtered:
     """`Filter.forward` for sequences that were checked: one step after the other, from state to state.
 
     Args:
@@ -113,13 +155,13 @@ def filter_step_by_step(
         project: whether to project.
 
     Returns:
-        State, states [..., T, m], log-likelihood [..., T], projection [..., T, D] and kept of a `Trace`.
+        See `Filtered`: states [..., T, m], log-likelihood [..., T], projection [..., T, D].
     """
     batch, length = y.shape[:-2], y.shape[-2]
 
     def run(state: State, start: int, stop: int, generator: Generators) -> Segment:
         """Samples start to stop - 1."""
-        record = Segment(state, [], [], [], [])
+        record = Segment(state, [], [], [], [], [])
         for t in range(start, stop):
             if t > 0:
                 state = filter._predict(state, dt, generator)
@@ -128,6 +170,9 @@ def filter_step_by_step(
             record.log_likelihood.append(likelihood.expand(batch))
             record.states.append(moving.expand(*batch, moving.shape[-1]))
             record.projection.append(filter.project(state) if project else state[0].new_zeros(*batch, 0))
+            felt = surprise_of(state)
+            if felt is not None:
+                record.felt.append(felt)
             if keep is not None:
                 record.kept.extend(pick(state, keep == t))
         return record._replace(state=state)
@@ -139,10 +184,11 @@ def filter_step_by_step(
         done = execute(state, start, stop, generator)
         state = done.state
         segments.append(done)
-    return (
+    return Filtered(
         state,
         torch.stack([moving for part in segments for moving in part.states], -2),
         torch.stack([value for part in segments for value in part.log_likelihood], -1),
         torch.stack([value for part in segments for value in part.projection], -2),
         None if keep is None else assemble([pick for part in segments for pick in part.kept], keep.shape),
+        along([felt for part in segments for felt in part.felt], batch),
     )

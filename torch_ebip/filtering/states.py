@@ -32,11 +32,13 @@ class Memory(NamedTuple):
         inflation: what a `SpreadRule` remembers, [...]; None if nothing.
         origin: int64 [..., E], as which of the prior's states each member started; None where the prior does not
         know.
+        surprise: a NamedTuple of tensors with ``level`` and ``counts`` [..., S]; None where nobody asks.
     """
 
     weighting: Any = None
     inflation: Tensor | None = None
     origin: Tensor | None = None
+    surprise: Any = None
 
     def __repr__(self) -> str:
         return brief(self)

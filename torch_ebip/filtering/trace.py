@@ -21,6 +21,10 @@ class Trace:
         projection: [..., T, D], mean of h(x) after each sample; [..., T, 0] if it was not asked for.
         kept: the states asked for with ``keep``, batch dimensions [..., K]; None if none were.
         engine: who held the members: "dense" or "span".
+        familiarity: [..., T], in [0, 1], how usual the largest surprise up to each sample is; NaN where it was not
+            calibrated. None where nobody asks.
+        surprise: [..., T, S], how surprising each of S sensors was, see `Surprise`; None where nobody asks.
+        counts: [..., T, S], in [0, 1], what each of them counted for it; None where nobody asks.
     """
 
     state: State
@@ -29,6 +33,9 @@ class Trace:
     projection: Tensor
     kept: State | None
     engine: str
+    familiarity: Tensor | None = None
+    surprise: Tensor | None = None
+    counts: Tensor | None = None
 
     def __repr__(self) -> str:
         *batch, length = self.log_likelihood.shape

@@ -15,13 +15,15 @@ from torch_ebip.interaction.basis import (
     select_basis,
     selection_table,
 )
+from torch_ebip.interaction.bounds import Bounds
+from torch_ebip.interaction.doubt import Doubt
 from torch_ebip.interaction.evidence import Evidence, EvidenceWeighting
-from torch_ebip.interaction.filters import (
+from torch_ebip.interaction.filter_kinds import (
     InteractionEnsembleFilter,
     InteractionExtendedFilter,
-    InteractionFilter,
     InteractionParticleFilter,
 )
+from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.forecast import Forecast
 from torch_ebip.interaction.gated_noise import PhaseGatedNoise
 from torch_ebip.interaction.horizons import HorizonShrinkage
@@ -35,6 +37,7 @@ from torch_ebip.interaction.priors import DemonstrationPrior, MomentPrior
 from torch_ebip.interaction.projection import BasisProjection
 from torch_ebip.interaction.recognition import Recognition
 from torch_ebip.interaction.shrinkage import Shrinkage
+from torch_ebip.interaction.surprise import InteractionSurprise
 from torch_ebip.interaction.table import DemonstrationTable
 from torch_ebip.interaction.trace import InteractionTrace
 
@@ -42,9 +45,11 @@ __all__ = [
     "BSplineBasis",
     "Basis",
     "BasisProjection",
+    "Bounds",
     "CandidateFit",
     "DemonstrationPrior",
     "DemonstrationTable",
+    "Doubt",
     "Evidence",
     "EvidenceWeighting",
     "Forecast",
@@ -56,6 +61,7 @@ __all__ = [
     "InteractionNoise",
     "InteractionParticleFilter",
     "InteractionPrimitive",
+    "InteractionSurprise",
     "InteractionTrace",
     "MixturePrior",
     "MomentPrior",

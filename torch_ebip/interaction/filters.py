@@ -10,20 +10,18 @@ from torch import Tensor
 
 from torch_ebip.common.ambient import eager
 from torch_ebip.common.draws import Generators
-from torch_ebip.filtering import functional
 from torch_ebip.filtering.base import EngineName, Filter
-from torch_ebip.filtering.ensemble import EnsembleFilter
-from torch_ebip.filtering.extended import ExtendedFilter, GaussianState
-from torch_ebip.filtering.members import MemberFilter
-from torch_ebip.filtering.particle import ParticleFilter
 from torch_ebip.filtering.protocols import MayLeaveSpan, View
 from torch_ebip.filtering.states import Memory, State
 from torch_ebip.interaction.attribution import affine_coefficients
+from torch_ebip.interaction.bounds import Bounds
+from torch_ebip.interaction.doubt import Doubt
 from torch_ebip.interaction.forecast import Forecast, Phases, as_phases, as_seconds_ahead
 from torch_ebip.interaction.phases.phase import PhaseModel
 from torch_ebip.interaction.projection import BasisProjection
 from torch_ebip.interaction.readout import Lead, Readout, lead_of
 from torch_ebip.interaction.recognition import Recognition
+from torch_ebip.interaction.surprise import InteractionSurprise
 from torch_ebip.interaction.trace import InteractionTrace
 
 
@@ -32,6 +30,8 @@ class InteractionFilter(Filter):
 
     Attributes:
         readout: what its forecasts pass through, such as a `HorizonShrinkage`; None: nothing.
+        doubt: what they pass through then, where the interaction surprises; None: nothing.
+        bounds: and last, what keeps them near what was demonstrated; None: nothing.
         recognition: which labels its demonstrations have; None: none.
 
     Raises:
@@ -40,12 +40,13 @@ class InteractionFilter(Filter):
 
     _trace = InteractionTrace
     readout: Readout | None
+    doubt: Doubt | None
+    bounds: Bounds | None
     recognition: Recognition | None
 
     def _check(self) -> None:
         """See `Filter._check`."""
-        self.readout = None
-        self.recognition = None
+        self.readout = self.doubt = self.bounds = self.recognition = None
         self._spread: tuple[Tensor, int, Tensor, list[Tensor]] | None = None
         model = self.model
         if not isinstance(model.dynamics, PhaseModel) or not isinstance(model.measurement, BasisProjection):
@@ -96,8 +97,9 @@ class InteractionFilter(Filter):
     def _narrow(self, view: View) -> None:
         """See `Filter._narrow`."""
         super()._narrow(view)
-        if self.readout is not None:
-            self.readout = self.readout.select(view)
+        for name in ("readout", "doubt", "bounds"):
+            passed = getattr(self, name)
+            setattr(self, name, None if passed is None else passed.select(view))
 
     @eager
     def forecast(self, state: State, phase: Phases | None = None, *, ahead: Phases | None = None) -> Forecast:
@@ -120,10 +122,15 @@ class InteractionFilter(Filter):
             forecast = self._forecast_ahead(state, seconds)
         else:
             forecast = self._forecast(state, self._phases_ahead(state, phase))
-        if self.readout is None:
+        if self.readout is None and self.doubt is None and self.bounds is None:
             return forecast
         lead = self.lead(state, forecast.phase, seconds)
-        return self.readout(forecast, lead, *self.demonstrated(lead.phase))
+        mean, variance = self.demonstrated(lead.phase)
+        if self.readout is not None:
+            forecast = self.readout(forecast, lead, mean, variance)
+        if self.doubt is not None:
+            forecast = self.doubt(forecast, lead, mean, variance, self.doubted(state))
+        return forecast if self.bounds is None else self.bounds(forecast, variance)
 
     @abstractmethod
     def _forecast(self, state: State, phase: Tensor) -> Forecast:
@@ -150,6 +157,32 @@ class InteractionFilter(Filter):
         _, _, mean, blocks = self._spread
         path, variance = basis.project_moments(phase, mean, blocks)
         return path, variance.clamp(min=0)
+
+    def doubted(self, state: State) -> Tensor:
+        """[...], how surprising the interaction of a ``state`` is of late, see `InteractionSurprise.doubt`."""
+        memory, surprise = getattr(state, "memory", None), self.surprise
+        if memory is None or memory.surprise is None or surprise is None:
+            return torch.zeros_like(self.phase(state))
+        return surprise.doubt(memory.surprise)
+
+    @property
+    def surprise(self) -> InteractionSurprise | None:
+        """What judges sensors and the interaction; None if nothing does."""
+        found = getattr(getattr(self, "analysis", None), "surprise", None)
+        return found if isinstance(found, InteractionSurprise) else None
+
+    @eager
+    def familiarity(self, state: State) -> Tensor:
+        """[...], in [0, 1], the chance of a surprise as large as the largest so far in an interaction like those
+        demonstrated; NaN where nothing was calibrated.
+
+        Args:
+            state: of this filter.
+        """
+        memory, surprise = getattr(state, "memory", None), self.surprise
+        if memory is None or memory.surprise is None or surprise is None:
+            return torch.full_like(self.phase(state), torch.nan)
+        return surprise.familiarity(memory.surprise)
 
     @eager
     def recognise(self, state: State) -> dict[str, Tensor]:
@@ -206,89 +239,3 @@ class InteractionFilter(Filter):
             return as_phases(phase, state[0])
         now = self.phase(state).clamp(0, 1).unsqueeze(-1)
         return now + (1 - now) * torch.linspace(0, 1, 50, dtype=now.dtype, device=now.device)
-
-
-class InteractionMemberFilter(InteractionFilter, MemberFilter):
-    """Forecasts of members."""
-
-    @eager
-    def forecast_members(self, state: State, phase: Tensor) -> Tensor:
-        """Each member's trajectory, [..., P, E, D], that a state implies at a phase [P] or [..., P]."""
-        departures, path = self._paths_ahead(state, as_phases(phase, state[0]))
-        return departures if path is None else departures + path
-
-    def _paths_ahead(self, state: State, phase: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Each member's trajectory [..., P, E, D] as it differs from that of the centre, [..., P, 1, D], if any."""
-        project_at, members, centre = self.basis_projection.at, state[0], self._centre(state)
-        phase = phase.to(members).expand(*members.shape[:-2], -1)
-        return project_at(members, phase), None if centre is None else project_at(centre.unsqueeze(-2), phase)
-
-    def _forecast(self, state: State, phase: Tensor) -> Forecast:
-        """Steps 4 and 5 of the paper's box: mean and variance over members of h at phases [..., P] to come.
-
-        At a given phase h is linear in the weights, so the mean of h is h of the mean, the paper's output.
-        """
-        departures, path = self._paths_ahead(state, phase)
-        phase = phase.to(departures).expand(departures.shape[:-2])
-        return self._of_members(state, phase, departures, path)
-
-    def _forecast_ahead(self, state: State, ahead: Tensor) -> Forecast:
-        """See `InteractionFilter._forecast_ahead`: every member at the phase where it will be."""
-        m, basis, members = self.phase_model.moving, self.basis_projection.basis, state[0]
-        moving = self.model.split(members)[0]
-        now, velocity = moving[..., 0].unsqueeze(-2), self.phase_model.velocity(moving).unsqueeze(-2)
-        end = ahead.isinf().unsqueeze(-1)
-        # A member that runs backwards, of a hand that goes back, waits: it has no end to come to.
-        phase = now + velocity.clamp(min=0) * torch.where(end, 0, ahead.unsqueeze(-1))
-        phase = torch.where(end, 1, phase).clamp(max=1)
-        departures = basis.project(phase, members[..., m:].unsqueeze(-3))
-        weights = None if state.weights is None else state.weights.unsqueeze(-2)
-        mean = functional.ensemble_mean(phase.unsqueeze(-1), weights).squeeze(-1)
-        centre, path = self._centre(state), None
-        if centre is not None:
-            # Members differ by where they are along the centre's path, too.
-            still = centre[..., m:].unsqueeze(-2)
-            path = basis.project(mean, still).unsqueeze(-2)
-            departures = departures + (basis.project(phase, still.unsqueeze(-2)) - path)
-        return self._of_members(state, mean, departures, path)
-
-    def _of_members(self, state: State, phase: Tensor, departures: Tensor, path: Tensor | None) -> Forecast:
-        """The forecast of members that differ by ``departures`` from a path that they share."""
-        weights = None if state.weights is None else state.weights.unsqueeze(-2).expand(departures.shape[:-1])
-        mean = functional.ensemble_mean(departures, weights)
-        variance = functional.ensemble_variance(departures, weights, self.fair)
-        members = departures
-        if path is not None:
-            mean, members = mean + path.squeeze(-2), departures + path
-        return Forecast(mean, variance, phase, members, weights, self.fair)
-
-
-class InteractionEnsembleFilter(InteractionMemberFilter, EnsembleFilter):
-    """The paper's eBIP and what is built on it: an `EnsembleFilter` of an interaction, made by `ebip`."""
-
-    def _leaves_span(self) -> str | None:
-        return super()._leaves_span() or self.analysis.leaves_span
-
-
-class InteractionParticleFilter(InteractionMemberFilter, ParticleFilter):
-    """A `ParticleFilter` of an interaction, made by `particle_filter`."""
-
-
-class InteractionExtendedFilter(InteractionFilter, ExtendedFilter):
-    """The paper's BIP: an `ExtendedFilter` of an interaction, made by `bip`."""
-
-    def _forecast_ahead(self, state: GaussianState, ahead: Tensor) -> Forecast:
-        """See `InteractionFilter._forecast_ahead`: at the mean velocity."""
-        now, velocity = self.phase(state).unsqueeze(-1), self.phase_velocity(state).unsqueeze(-1)
-        phase = torch.where(ahead.isinf(), 1, now + velocity.clamp(min=0) * torch.where(ahead.isinf(), 0, ahead))
-        phase = phase.clamp(max=1)
-        return self._forecast(state, phase)
-
-    def _forecast(self, state: GaussianState, phase: Tensor) -> Forecast:
-        """h(phi, mu) and Phi(phi) Sigma_ww Phi(phi)' at phases [..., P] to come."""
-        basis, m = self.basis_projection.basis, self.phase_model.moving
-        phase = phase.to(state.mean).expand(*state.mean.shape[:-1], phase.shape[-1])
-        mean = basis.project(phase, state.mean[..., m:].unsqueeze(-2))
-        # Where the prior is rank deficient rounding can leave less than nothing.
-        variance = basis.project_covariance(phase, state.covariance[..., m:, m:]).clamp(min=0)
-        return Forecast(mean, variance, phase)

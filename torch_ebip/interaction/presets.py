@@ -16,7 +16,7 @@ from torch_ebip.filtering.updates.trust import RobustWeights
 from torch_ebip.filtering.updates.update import Update
 from torch_ebip.interaction.basis.base import Basis
 from torch_ebip.interaction.evidence import EvidenceWeighting
-from torch_ebip.interaction.filters import (
+from torch_ebip.interaction.filter_kinds import (
     InteractionEnsembleFilter,
     InteractionExtendedFilter,
     InteractionParticleFilter,

@@ -27,7 +27,8 @@ from torch_ebip.interaction.basis.polynomial import PolynomialBasis
 from torch_ebip.interaction.basis.sigmoid import SigmoidBasis
 from torch_ebip.interaction.basis.stacked import StackedBasis
 from torch_ebip.interaction.evidence import EvidenceWeighting
-from torch_ebip.interaction.filters import InteractionEnsembleFilter, InteractionFilter
+from torch_ebip.interaction.filter_kinds import InteractionEnsembleFilter
+from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.gated_noise import PhaseGatedNoise
 from torch_ebip.interaction.horizons import HorizonShrinkage
 from torch_ebip.interaction.noise import InteractionNoise
@@ -39,6 +40,7 @@ from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.interaction.readout import Readout
 from torch_ebip.interaction.recognition import PHASES, Recognition
 from torch_ebip.interaction.shrinkage import Shrinkage
+from torch_ebip.learning.caution import describe_caution, give_caution
 from torch_ebip.recordings.layout import Layout, Modality
 
 BASES: dict[str, type[Basis]] = {
@@ -138,6 +140,7 @@ def describe_filter(filter: InteractionFilter, primitive: InteractionPrimitive) 
         "phase": _describe_phase(filter.phase_model),
         "readout": _describe_readout(filter.readout),
         "recognition": filter.recognition is not None and len(filter.recognition.sharpness) > 0,
+        **describe_caution(filter),
     }
     again = build_filter(primitive, description)
     ours, theirs = ({name: type(m).__name__ for name, m in each.named_modules()} for each in (filter, again))
@@ -179,6 +182,7 @@ def build_filter(primitive: InteractionPrimitive, description: Description) -> I
             ones = primitive.weights.new_ones(len(weighting.forgetting.start), len(PHASES))
             filter.recognition = Recognition(primitive.labels, ones).to(primitive.weights)
         filter.readout = None if readout is None else _readout_of(readout, primitive)
+        give_caution(filter, primitive, description)
         return filter
     except (AttributeError, ArithmeticError, LookupError, TypeError, ValueError) as error:
         raise ValueError(f"a description of no filter that `ebip` makes: {error}") from error

@@ -99,7 +99,8 @@ def learn_drawing(held_out: HeldOut, filter: InteractionFilter, interactions: Te
 def _of(said: Said, ours: Tensor) -> Said:
     """Of some of the targets, bool [D]."""
     towards, wanted, own, apart, level = (tensor[:, :, :, ours] for tensor in said[1:6])
-    return Said(said.interaction, towards, wanted, own, apart, level, said.place, said.mean[:, :, :, ours])
+    mean = said.mean[:, :, :, ours]
+    return Said(said.interaction, towards, wanted, own, apart, level, said.place, mean, said.doubt)
 
 
 def _best_shares(part: Said, fold: Tensor, folds: int, pull: float) -> tuple[Tensor, Tensor]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from torch_ebip.recordings.layout import Layout
 
@@ -62,6 +62,11 @@ class Monitor:
     def text(self, name: str, markdown: str) -> None:
         """A text tab of this name, written in markdown."""
         self._send("add_text", name, markdown)
+
+    def values(self, name: str, values: Mapping[str, Tensor], step: int = 0) -> None:
+        """The distribution of each of some values [B] at this step, under a group of this name."""
+        for each, numbers in values.items():
+            self._send("add_histogram", f"{name}/{each}", numbers, step)
 
     def figure(self, name: str, figure: Figure, step: int) -> None:
         """A matplotlib figure of this name and step, which is closed."""

@@ -262,3 +262,30 @@ def _joints(arm: RobotArm, layout: Layout, dofs: Tensor, targets: list[str]) -> 
         if theirs != unit:
             raise ValueError(f"the arm's joint {joint!r} is in {unit!r}, but {name!r} of the layout in {theirs!r}")
     return [targets.index(name) for name in names]
+
+
+def objective_for(
+    primitive: InteractionPrimitive,
+    targets: Tensor,
+    names: Sequence[str],
+    ahead: Sequence[float],
+    arm: RobotArm | ForwardKinematicsLoss | None,
+    joints: str | None,
+) -> ForecastObjective:
+    """What `learn` minimises.
+
+    Args:
+        primitive: of the demonstrations.
+        targets: bool [D], the DoFs of the modalities with these ``names``.
+        names: of the targets.
+        ahead: horizons, s.
+        arm, joints: see `learn`.
+    """
+    if arm is None:
+        return ForecastObjective(primitive, targets, ahead=ahead)
+    loss = arm if isinstance(arm, ForwardKinematicsLoss) else ForwardKinematicsLoss(arm, rotation_weight=0.1)
+    layout = primitive.layout
+    dofs = layout.mask(joints_of(loss.arm, layout, names) if joints is None else [joints])
+    return ForecastObjective(
+        primitive, targets, weights=Weights(tool=1.0), arm=loss, arm_dofs=dofs.to(targets.device), ahead=ahead
+    )

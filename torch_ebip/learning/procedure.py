@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import platform
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from torch_ebip.common.files import write_json
 from torch_ebip.interaction.basis.selection import rank_candidates, select_basis, selection_table
 from torch_ebip.interaction.basis.stacked import StackedBasis
-from torch_ebip.interaction.filters import InteractionEnsembleFilter
+from torch_ebip.interaction.filter_kinds import InteractionEnsembleFilter
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.kinematics import RobotArm
+from torch_ebip.learning.caution import familiar, learn_caution
 from torch_ebip.learning.configuration import Task
 from torch_ebip.learning.drawing import Drawn, learn_drawing
 from torch_ebip.learning.groups import labelled
@@ -27,21 +26,21 @@ from torch_ebip.learning.horizons import horizon_name, reached
 from torch_ebip.learning.interaction_model import NAME, InteractionModel
 from torch_ebip.learning.losses import ForwardKinematicsLoss
 from torch_ebip.learning.monitor import Monitor
-from torch_ebip.learning.objective import ForecastObjective, Weights, joints_of
+from torch_ebip.learning.objective import objective_for
 from torch_ebip.learning.partition import generator_of
 from torch_ebip.learning.place import enter, fingerprint
 from torch_ebip.learning.progress import Reporter
 from torch_ebip.learning.ranks import Ranks
 from torch_ebip.learning.recognising import learn_recognition
 from torch_ebip.learning.remaining import remaining_error
-from torch_ebip.learning.report import STAGES, Report, verdict_of
+from torch_ebip.learning.report import STAGES, Report, described, verdict_of, versions
 from torch_ebip.learning.settings import TuningSettings
 from torch_ebip.learning.stages import Scores, reference_scores, score
 from torch_ebip.learning.starts import FACTORS, TRIES, Start, best_factor, best_start, scaled, tunable
 from torch_ebip.learning.tuner import Tuner
 from torch_ebip.recordings.demonstrations import Demonstrations
 
-PROCEDURE = 2  # what another edition of this file began in a folder is not gone on with
+PROCEDURE = 3  # what another edition of this file began in a folder is not gone on with
 FEWEST = 10
 """Demonstrations below which there is no gradient: those kept for validation would say nothing."""
 MOST = 100
@@ -64,6 +63,7 @@ class Procedure:
     shrink: bool
     ahead: tuple[float, ...]
     memories: int
+    chances: dict[str, float]
     ranks: Ranks
 
     @property
@@ -74,7 +74,7 @@ class Procedure:
     @property
     def work(self) -> int:
         """Units: every filter that is tried, and every step."""
-        return len(FACTORS) + 2 + TRIES + (self.steps if self.tunes else 0) + 5
+        return len(FACTORS) + 2 + TRIES + (self.steps if self.tunes else 0) + 6
 
     def prepare(
         self, arm: RobotArm | ForwardKinematicsLoss | None, joints: str | None, basis: StackedBasis | None
@@ -92,14 +92,7 @@ class Procedure:
         labels = primitive.labels = self.known.labels
         self.groups = {} if labels is None or labels == given else {label: labels.count(label) for label in labels}
         ahead = self._horizons()
-        if arm is None:
-            objective = ForecastObjective(primitive, targets, ahead=ahead)
-        else:
-            loss = arm if isinstance(arm, ForwardKinematicsLoss) else ForwardKinematicsLoss(arm, rotation_weight=0.1)
-            dofs = layout.mask(joints_of(loss.arm, layout, self.targets) if joints is None else [joints])
-            objective = ForecastObjective(
-                primitive, targets, weights=Weights(tool=1.0), arm=loss, arm_dofs=dofs.to(targets.device), ahead=ahead
-            )
+        objective = objective_for(primitive, targets, self.targets, ahead, arm, joints)
         masks = {name: layout.mask(names).to(targets.device) for name, names in self.subsets.items()}
         self.task = Task(primitive, objective, targets, masks)
         self.held_out = HeldOut(self.known, self.task, self.settings, self.ranks)
@@ -137,6 +130,7 @@ class Procedure:
             "shrink": self.shrink,
             "ahead": [horizon_name(a) for a in self.ahead],
             "memories": self.memories,
+            "chances": self.chances,
             "scan": self.scan,
             "steps": self.steps,
             "settings": {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(self.settings).items()},
@@ -146,8 +140,7 @@ class Procedure:
         """All stages; the best of them."""
         self.place, self.monitor, self.reporter = place, monitor, reporter
         if monitor is not None:
-            lines = "\n".join(f"- `{key}`: {value}" for key, value in self.identity().items())
-            monitor.text("configuration", lines)
+            monitor.text("configuration", "\n".join(f"- `{key}`: {value}" for key, value in self.identity().items()))
             if self.ranking is not None:
                 monitor.text("basis", f"```\n{selection_table(self.ranking)}\n```")
         self.filters: dict[str, InteractionEnsembleFilter] = {}
@@ -162,7 +155,7 @@ class Procedure:
             if not self.filters:
                 raise
             interrupted = True
-        interrupted = interrupted or self.said.get("interrupted_at") is not None
+        interrupted |= self.said.get("interrupted_at") is not None
         names = [name for name in self.filters if self.known.labels is None or name in WEIGHING] or list(self.filters)
         chosen = min(names, key=lambda name: self.scores[name]["remaining"])
         drawn = None
@@ -170,6 +163,7 @@ class Procedure:
             try:
                 drawn = self._draw(self.filters[chosen])
                 self._recognise(self.filters[chosen])
+                self._doubt(self.filters[chosen])
             except KeyboardInterrupt:
                 interrupted = True
         return self._finish(chosen, drawn, interrupted)
@@ -258,6 +252,15 @@ class Procedure:
             order = torch.randperm(len(labels), generator=generator_of(self.settings.seed, -2), device="cpu")[:MOST]
             filter.recognition, self.said["recognition"] = learn_recognition(self.held_out, filter, labels, order)
 
+    def _doubt(self, filter: InteractionEnsembleFilter) -> None:
+        """What would surprise the filter, and what it then says."""
+        self.reporter.stage("surprise")
+        self.said["surprise"], remarks = learn_caution(self.held_out, self.known, filter, self.chances)
+        self.remarks.extend(remarks)
+        if not remarks and self.monitor is not None:
+            self.monitor.values("surprise", familiar(self.held_out, filter, self.scored))
+        self.reporter.tick()
+
     def _finish(self, chosen: str, drawn: Drawn | None, interrupted: bool) -> InteractionModel:
         """Report and keep."""
         filter = self.filters[chosen]
@@ -267,9 +270,7 @@ class Procedure:
         elif self.steps and not self.tunes:
             reason = f"no gradient: {len(self.known)} demonstrations are too few to tell when to stop"
         gain = None if drawn is None else drawn.gain if self.shrink else drawn.gain_alone
-        names = [name for name in STAGES if name in self.scores]
-        stages = {name: self.scores[name] for name in names}
-        layout, basis = self.known.layout, self.primitive.basis
+        stages = {name: self.scores[name] for name in STAGES if name in self.scores}
         report = Report(
             {
                 "verdict": verdict_of(stages, chosen, len(self.scored), gain, reason),
@@ -282,14 +283,9 @@ class Procedure:
                 "groups": self.groups,
                 "interrupted": interrupted,
                 **self.said,
-                "basis": {m.name: str(basis.bases[layout.slice(m.name).start]) for m in layout.modalities},
-                "n_weights": basis.n_weights,
+                **described(self.known.layout, self.primitive.basis),
                 "settings": self.identity(),
-                "versions": {
-                    "python": platform.python_version(),
-                    "torch": str(torch.__version__),
-                    "numpy": np.__version__,
-                },
+                "versions": versions(),
                 "seconds": round(time.monotonic() - self.began, 1),
             }
         )

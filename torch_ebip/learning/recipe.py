@@ -16,6 +16,7 @@ from typing import Any
 from torch_ebip.common.ambient import in_own_modes
 from torch_ebip.common.arguments import as_count
 from torch_ebip.interaction.basis.stacked import StackedBasis
+from torch_ebip.interaction.tail import as_chances
 from torch_ebip.kinematics import RobotArm
 from torch_ebip.learning.horizons import AHEAD
 from torch_ebip.learning.interaction_model import InteractionModel
@@ -47,6 +48,8 @@ def learn(
     ahead: Sequence[float] = AHEAD,
     memories: int = 2,
     scan: int = 48,
+    suspect: float = 0.01,
+    rejected: float = 0.001,
     ranks: Ranks | None = None,
     **tuning: Any,
 ) -> InteractionModel:
@@ -78,6 +81,8 @@ def learn(
         ahead: horizons that count alike, in s, increasing; the last is infinity, the end.
         memories: of the evidence: 2, a fast and a slow one, or the fast one alone.
         scan: how many interactions decide where the gradient starts.
+        suspect, rejected: chances with which a sensor that is well seems suspect, or is rejected, in an interaction
+            like those demonstrated; see `InteractionSurprise`.
         ranks: the processes that share the work; default: this one.
         tuning: further settings of `TuningSettings`, such as ``batch_size``.
 
@@ -124,9 +129,12 @@ def learn(
         raise ValueError(f"ahead must be increasing seconds, math.inf (the end) the last, got {list(ahead)}")
     if as_count("memories", memories) > 2:
         raise ValueError(f"memories must be 1 or 2, got {memories}")
+    chances = as_chances(suspect, rejected)
     settings = settings_for(known, max(steps, 1), seed, members, tuning)
     ranks = Ranks() if ranks is None else ranks
-    run = Procedure(known, tuple(targets), shown, settings, members, scan, steps, shrink, ahead, memories, ranks)
+    run = Procedure(
+        known, tuple(targets), shown, settings, members, scan, steps, shrink, ahead, memories, chances, ranks
+    )
     run.prepare(arm, joints, basis)
     place = None if folder is None else Path(folder)
     if place is not None:

@@ -3,8 +3,15 @@
 from __future__ import annotations
 
 import copy
+import platform
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
+
+import numpy as np
+import torch
+
+from torch_ebip.interaction.basis.stacked import StackedBasis
+from torch_ebip.recordings.layout import Layout
 
 STAGES = ("mean", "nearest", "closed_form", "factor", "start", "gradient", "shrinkage")
 """In the order in which they are reported; the first two are what can be said without a filter."""
@@ -25,7 +32,8 @@ class Report(Mapping[str, Any]):
     read-out: see `STAGES`), ``chosen`` (the stage whose filter the model has), ``interactions`` (how many were left
     out to score them), ``demonstrations``, ``factor``, ``start``, ``validation`` (loss by step, after the read-out),
     ``best_step``, ``stopped_early``, ``shrinkage`` (mean shares by target and horizon), ``horizons``, ``remarks``
-    (what was left out, and why), ``basis``, ``settings``, ``versions``, ``seconds``.
+    (what was left out, and why), ``surprise`` (what of interactions left out is unusual, and what is then said; empty
+    where they were too few), ``basis``, ``settings``, ``versions``, ``seconds``.
 
     Args:
         content: plain values.
@@ -126,3 +134,14 @@ def _at(horizons: Sequence[str]) -> str:
     """``at 0.1 s, 0.25 s and the end``."""
     named = ["the end" if horizon == "end" else horizon for horizon in horizons]
     return f"at {named[0]}" if len(named) == 1 else f"at {', '.join(named[:-1])} and {named[-1]}"
+
+
+def versions() -> dict[str, str]:
+    """Of what computed it."""
+    return {"python": platform.python_version(), "torch": str(torch.__version__), "numpy": np.__version__}
+
+
+def described(layout: Layout, basis: StackedBasis) -> dict[str, Any]:
+    """Which basis each modality of a layout has, and how many weights all have together."""
+    named = {m.name: str(basis.bases[layout.slice(m.name).start]) for m in layout.modalities}
+    return {"basis": named, "n_weights": basis.n_weights}

@@ -26,6 +26,7 @@ class Said(NamedTuple):
         level: [R, K, P, D, J], see `level_hats`.
         place: [R, K, P, S], see `horizon_hats`.
         mean: [R, K, P, D], of the demonstrations, units of the scale.
+        doubt: [R, K], how surprised the filter was, see `InteractionSurprise.doubt`; 0 if it never is.
     """
 
     interaction: Tensor
@@ -36,6 +37,7 @@ class Said(NamedTuple):
     level: Tensor
     place: Tensor
     mean: Tensor
+    doubt: Tensor
 
     def __repr__(self) -> str:
         return brief(self)
@@ -61,7 +63,19 @@ def what_it_says(held_out: HeldOut, filter: InteractionFilter, interactions: Ten
             place = horizon_hats(lead, seconds)
             values = (forecast.mean - mean, shown.truth - mean, widths.own, widths.demonstrated)
             towards, wanted, own, apart = (value / scale for value in values)
-            parts.append(Said(shown.interactions, towards, wanted, own, apart, level, place, mean / scale))
+            parts.append(
+                Said(
+                    shown.interactions,
+                    towards,
+                    wanted,
+                    own,
+                    apart,
+                    level,
+                    place,
+                    mean / scale,
+                    trial.filter.doubted(state),
+                )
+            )
     shares = held_out.ranks.gather([[tensor.cpu() for tensor in part] for part in parts])
     together = [part for share in shares for part in share]
     device = primitive.weights.device

@@ -18,7 +18,8 @@ from torch_ebip.common.files import read_json, write_json
 from torch_ebip.filtering.noise.constraints import AboveOne
 from torch_ebip.filtering.updates.trust import RobustWeights
 from torch_ebip.interaction.basis.bspline import BSplineBasis
-from torch_ebip.interaction.filters import InteractionEnsembleFilter, InteractionFilter
+from torch_ebip.interaction.filter_kinds import InteractionEnsembleFilter
+from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.presets import ebip
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.learning.held_out import HeldOut

@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 from torch_ebip.common.draws import seeded, set_states, states_of
-from torch_ebip.interaction.filters import InteractionEnsembleFilter, InteractionFilter
+from torch_ebip.filtering.sequence import surprise_of
+from torch_ebip.interaction.filter_kinds import InteractionEnsembleFilter
+from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.forecast import Forecast
 from torch_ebip.live.filter import LiveFilter, LiveSnapshot
 
@@ -39,6 +41,12 @@ class Engine(Protocol):
 
     def labels(self) -> dict[str, float]:
         """Probability of each label; empty where the filter cannot say."""
+
+    def familiarity(self) -> float:
+        """How usual the largest surprise so far is, 0 to 1; NaN where that was not calibrated."""
+
+    def counts(self) -> list[float] | None:
+        """What each modality of the layout counts, 0 to 1; None where nobody judges."""
 
 
 def make_engine(filter: InteractionFilter, sensors: Tensor, controlled: Tensor, slots: int, seed: int) -> Engine:
@@ -99,6 +107,15 @@ class _LiveEngine:
         if live.filter.recognition is None or live.carrier.memory.weighting is None:
             return {}
         return {label: float(probability) for label, probability in live.recognise().items()}
+
+    def familiarity(self) -> float:
+        """See `Engine`."""
+        return float(self._live.familiarity)
+
+    def counts(self) -> list[float] | None:
+        """See `Engine`."""
+        counts = self._live.counts
+        return None if counts is None else counts.tolist()
 
 
 def _tensors(state: Any) -> list[Tensor]:
@@ -164,3 +181,13 @@ class _StateEngine:
         if self._filter.recognition is None or memory is None or memory.weighting is None:
             return {}
         return {label: float(p) for label, p in self._filter.recognise(self._state).items()}
+
+    @torch.no_grad()
+    def familiarity(self) -> float:
+        """See `Engine`."""
+        return float(self._filter.familiarity(self._state))
+
+    def counts(self) -> list[float] | None:
+        """See `Engine`."""
+        felt = surprise_of(self._state)
+        return None if felt is None else felt.counts.tolist()

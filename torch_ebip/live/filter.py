@@ -22,7 +22,7 @@ from torch_ebip.filtering.carriers.checks import measured_dofs
 from torch_ebip.filtering.carriers.plan import kept
 from torch_ebip.filtering.carriers.span import SpanCarrier
 from torch_ebip.filtering.states import EnsembleState, Memory
-from torch_ebip.interaction.filters import InteractionEnsembleFilter
+from torch_ebip.interaction.filter_kinds import InteractionEnsembleFilter
 from torch_ebip.interaction.forecast import Forecast, Phases
 
 
@@ -148,8 +148,7 @@ class LiveFilter:
 
         Draws too, if the filter has a generator; torch's global one is not turned back.
         """
-        self.carrier.matrix.copy_(snapshot.matrix)
-        self.carrier.memory = snapshot.memory
+        self.carrier.restore(snapshot.matrix, snapshot.memory)
         set_states(self.generator, snapshot.generators)
 
     @in_own_modes
@@ -174,6 +173,22 @@ class LiveFilter:
     def recognise(self) -> dict[str, Tensor]:
         """See `InteractionFilter.recognise`; nothing that sensors do not see is brought up to date for it."""
         return self.filter.recognised(self.carrier.memory, self.phase)
+
+    @property
+    @in_own_modes
+    @torch.no_grad()
+    def familiarity(self) -> Tensor:
+        """[...], in [0, 1], how usual the largest surprise so far is; NaN where that was not calibrated."""
+        surprise, felt = self.filter.surprise, self.carrier.memory.surprise
+        if surprise is None or felt is None:
+            return self.phase * torch.nan
+        return surprise.familiarity(felt)
+
+    @property
+    def counts(self) -> Tensor | None:
+        """[..., S], in [0, 1], what each sensor counts, 0 if it is rejected; None where nobody judges."""
+        felt = self.carrier.memory.surprise
+        return None if felt is None else felt.counts
 
     @in_own_modes
     @torch.no_grad()

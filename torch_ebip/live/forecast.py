@@ -25,6 +25,9 @@ class SessionForecast(NamedTuple):
         stale: names of the sensors of which nothing was used for a while, or ever.
         horizon: seconds from the present that were asked for, P of them; empty for the end alone.
         labels: probability of each of the labelled interactions, by name; empty where there are none.
+        familiarity: 0 to 1, the chance of a surprise as large as the largest so far in an interaction like those
+            demonstrated; below .01 hardly any of those is. NaN where it was not calibrated, see `learn`.
+        states: of each sensor "ok", "suspect" (it counts less) or "rejected" (nothing, until it agrees again).
     """
 
     time: float
@@ -36,6 +39,8 @@ class SessionForecast(NamedTuple):
     stale: tuple[str, ...]
     horizon: tuple[float, ...] = ()
     labels: Mapping[str, float] = MappingProxyType({})
+    familiarity: float = math.nan
+    states: Mapping[str, str] = MappingProxyType({})
 
     def __repr__(self) -> str:
         return brief(self)

@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
+from torch_ebip.interaction.bounds import demonstrated_range
 from torch_ebip.interaction.primitive import InteractionPrimitive
+from torch_ebip.interaction.surprise_memory import STATES
 
 Array = npt.NDArray[np.float64]
 
@@ -28,6 +29,8 @@ class SensorReport:
         early: from before the interaction, or too far ahead of it for any clock.
         frozen: ticks at which the sensor said the same for too long.
         last: time of the newest sample that was accepted, s; minus infinity if there is none.
+        state: "ok", "suspect" or "rejected", by how surprising it was when it was filtered last; see
+            `InteractionSurprise`.
     """
 
     accepted: int = 0
@@ -39,6 +42,7 @@ class SensorReport:
     early: int = 0
     frozen: int = 0
     last: float = -math.inf
+    state: str = STATES[0]
 
 
 class Ranges(NamedTuple):
@@ -53,13 +57,7 @@ def training_ranges(primitive: InteractionPrimitive, margin: float) -> Ranges:
 
     Residuals count too: five standard deviations on either side before it is widened.
     """
-    phase = torch.linspace(0, 1, 51, dtype=primitive.weights.dtype, device=primitive.weights.device)
-    least = torch.full_like(primitive.residual_variance, torch.inf)
-    most = -least
-    for weights in torch.split(primitive.weights, 64):  # a few at a time: all at once would be large
-        paths = primitive.basis.project(phase[:, None], weights)
-        least = torch.minimum(least, paths.amin((0, 1)))
-        most = torch.maximum(most, paths.amax((0, 1)))
+    least, most = demonstrated_range(primitive)
     noise = 5 * primitive.residual_variance.sqrt()
     low, high = ((value.double().cpu().numpy()) for value in (least - noise, most + noise))
     return Ranges(low - margin * (high - low), high + margin * (high - low))

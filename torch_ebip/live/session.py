@@ -178,8 +178,11 @@ class InteractionSession:
             phase = min(max(phase, 0.0), 1.0)
             left = (1 - phase) / velocity if velocity > 0 else math.inf
             now, stale = self._timeline.now, tuple(self.sensors[i] for i in self._timeline.stale())
-            labels = self._timeline.labels()
-            return SessionForecast(now, phase, left, self.dofs, mean, deviation, stale, tuple(horizons), labels)
+            timeline = self._timeline
+            return SessionForecast(
+                now, phase, left, self.dofs, mean, deviation, stale, tuple(horizons),
+                timeline.labels(), timeline.familiarity(), dict(zip(self.sensors, timeline.states(), strict=True)),
+            )  # fmt: skip
 
     @property
     def failed_updates(self) -> int:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 
+from torch_ebip.common.modules import sharing
+from torch_ebip.interaction.bounds import Bounds
 from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.forecast import Forecast
 from torch_ebip.interaction.primitive import InteractionPrimitive
+from torch_ebip.interaction.surprise_memory import STATES, state_of
 from torch_ebip.live.engine import make_engine
 from torch_ebip.live.intake import Array, Freshness, Intake, SensorReport, as_vector, training_ranges
 from torch_ebip.live.opening import Clock, Lost, Opening
@@ -44,11 +48,15 @@ class Timeline:
         self._patience = patience_of(settings.frozen_after, primitive, sensors)
         # A sample may belong to a tick half a tick before it was taken.
         behind = math.floor(settings.window / dt + 0.5 + TOLERANCE) + 1
+        self._modalities = [layout.names.index(name) for name in sensors]
         self._columns = [layout.slice(name) for name in sensors]
         self._ranges = training_ranges(primitive, settings.margin)
         self._reach = behind, math.ceil(settings.longest_gap / dt)
         self._slots = behind + 2
         # One more than are in turn: the state before anything was seen.
+        # Whatever it believes, what it says stays near what was demonstrated.
+        filter = sharing(filter)
+        filter.bounds = Bounds.of(primitive) if filter.bounds is None else filter.bounds
         self._engine = make_engine(filter, layout.mask(sensors), layout.controlled, self._slots + 1, settings.seed)
         self._engine.save(self._slots)
         self._like = next(filter.parameters())
@@ -163,6 +171,15 @@ class Timeline:
         """Probability of each label."""
         return self._engine.labels()
 
+    def familiarity(self) -> float:
+        """How usual the largest surprise so far is; NaN where that was not calibrated."""
+        return self._engine.familiarity()
+
+    def states(self) -> list[str]:
+        """Of each sensor, see `SessionForecast`."""
+        counts = self._engine.counts()
+        return [STATES[0] if counts is None else state_of(counts[number]) for number in self._modalities]
+
     def stale(self) -> list[int]:
         """Numbers of the sensors of which nothing was used for a while, or ever."""
         oldest = self._now - self.settings.stale_after
@@ -171,7 +188,8 @@ class Timeline:
 
     def report(self) -> list[SensorReport]:
         """A copy of the counts of each sensor."""
-        return self._intake.report(self._current())
+        reports = self._intake.report(self._current())
+        return [replace(report, state=state) for report, state in zip(reports, self.states(), strict=True)]
 
     def _begin(self, start: float) -> None:
         """Start at this time, s, with nothing seen."""

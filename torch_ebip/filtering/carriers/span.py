@@ -33,7 +33,7 @@ from torch_ebip.filtering.functional.linear import FactorisationError, cholesky
 from torch_ebip.filtering.functional.moments import member_shares
 from torch_ebip.filtering.functional.update import Spread
 from torch_ebip.filtering.model import StateSpace
-from torch_ebip.filtering.states import EnsembleState, map_state
+from torch_ebip.filtering.states import EnsembleState, Memory, map_state
 from torch_ebip.filtering.updates.rules import Columns, Rule
 from torch_ebip.filtering.updates.update import Update, analyse
 
@@ -81,6 +81,7 @@ class SpanCarrier(Carrier):
         self._middle = state.centre[..., view.state[m:]]
         self.matrix, self._moving = self._columns.matrix, self._columns.moving
         self._advance = part.dynamics.advancer(self._moving)
+        self._mean: Tensor | None = None  # as it is; None: to be computed
         E = start.shape[-2]
         self._draws = start.new_empty(*start.shape[:-1], m)
         self._draws_by_entry = self._draws.transpose(-1, -2)
@@ -103,7 +104,9 @@ class SpanCarrier(Carrier):
     @property
     def mean(self) -> Tensor:
         """See `Carrier.mean`."""
-        return (self._moving @ self._even).squeeze(-1)
+        if self._mean is None:
+            self._mean = (self._moving @ self._even).squeeze(-1)
+        return self._mean
 
     @property
     def finite(self) -> bool:
@@ -129,16 +132,22 @@ class SpanCarrier(Carrier):
         centre = torch.cat([centre[..., :m], centre[..., m + columns]], dim=-1)
         return EnsembleState(self._columns.members(columns, entry), memory, centre)
 
+    def restore(self, matrix: Tensor, memory: Memory) -> None:
+        """Go back to a copy of the ``matrix`` [..., m + k, E], and to the memory that went with it."""
+        self.matrix.copy_(matrix)
+        self.memory, self._mean = memory, None
+
     def predict(self, dt: float) -> None:
         """x = g(x) + N(0, Q) over dt seconds, finite and not negative."""
         if self._process_versions.changed() or self._step_factor is None or self._step_factor[0] != dt:
             seconds = self.matrix.new_tensor(dt)
             factor = self._process.factor(seconds)
             self._step_factor = dt, factor.expand(*self.batch_shape, *factor.shape[-2:]), seconds
+        self._mean = None
         self._advance(dt)
         self._drawn(self._draws)
         self._add_product(self._moving, self._step_factor[1], self._draws_by_entry)
-        if self.memory.weighting is not None:
+        if self.memory.weighting is not None or self.memory.surprise is not None:
             self.memory = self._update.forget(self.memory, self._step_factor[2])
 
     def take(self, y: Tensor, measured: tuple[bool, ...], mask: Tensor | None) -> Tensor:
@@ -183,6 +192,7 @@ class SpanCarrier(Carrier):
         self, rule: Rule, measured: Measured, taper: Taper | None, spread: Spread, perturbations: Tensor | None
     ) -> Tensor:
         """See `Carrier.move`; perturbations [..., K, E]."""
+        self._mean = None
         plan, seen, weighted, even = self._plan, self._seen, self._weighted, self._shares
         y, deviation, R = plan.values_by_dof, self._deviation, self._R
         if measured is not self._measured:  # other values and deviations are believed

@@ -16,6 +16,7 @@ from torch_ebip.filtering.updates.inflation import SpreadRule
 from torch_ebip.filtering.updates.localisation import Localisation
 from torch_ebip.filtering.updates.part import Part
 from torch_ebip.filtering.updates.rules import Rule, Stochastic
+from torch_ebip.filtering.updates.surprise import Noticed, Surprise, believed
 from torch_ebip.filtering.updates.trust import RobustWeights
 from torch_ebip.filtering.updates.weighting import Seen, Weighting
 
@@ -30,6 +31,7 @@ class Slots(NamedTuple):
     """The parts of an update, by their places."""
 
     rule: Rule
+    surprise: Surprise | None
     trust: tuple[RobustWeights, ...]
     weighting: Weighting | None
     localisation: Localisation | None
@@ -41,6 +43,7 @@ class Update(nn.Module):
 
     Args:
         rule: how an innovation moves the members: `Stochastic`, the paper's, or `SquareRoot`.
+        surprise: judges sensors by what was expected of them, before anything else does.
         trust: what surprising values count, each on top of those before it: `StudentT`, `Huber`, `Gate`.
         weighting: weighs members by what was seen.
         localisation: factors on the cross-covariances of blocks of the state.
@@ -51,6 +54,7 @@ class Update(nn.Module):
         >>> update = Update(SquareRoot(), trust=[StudentT()], inflation=Inflation(1.01))
     """
 
+    surprise: Surprise | None
     trust: nn.ModuleList
     weighting: Weighting | None
     localisation: Localisation | None
@@ -63,9 +67,11 @@ class Update(nn.Module):
         weighting: Weighting | None = None,
         localisation: Localisation | None = None,
         inflation: SpreadRule | None = None,
+        surprise: Surprise | None = None,
     ) -> None:
         super().__init__()
         self.rule = Stochastic() if rule is None else rule
+        self.surprise = surprise
         self.trust = nn.ModuleList(trust)
         self.weighting = weighting
         self.localisation = localisation
@@ -74,7 +80,7 @@ class Update(nn.Module):
     @property
     def parts(self) -> list[Part]:
         """All that there are, in their order."""
-        slots = (self.rule, *self.trust, self.weighting, self.localisation, self.inflation)
+        slots = (self.rule, self.surprise, *self.trust, self.weighting, self.localisation, self.inflation)
         return [part for part in slots if isinstance(part, Part)]
 
     @property
@@ -90,26 +96,32 @@ class Update(nn.Module):
             origin: int64 [..., E], as which of the prior's states; None where it does not know.
         """
         weighting = None if self.weighting is None or origin is None else self.weighting.start(origin)
-        return Memory(weighting, None if self.inflation is None else self.inflation.start(members), origin)
+        inflation = None if self.inflation is None else self.inflation.start(members)
+        return Memory(weighting, inflation, origin, None if self.surprise is None else self.surprise.start(members))
 
     def complete(self, memory: Memory, members: Tensor) -> Memory:
         """The memory of a state made by hand, with members [..., E, n], as if it had seen nothing."""
-        if self.inflation is None or memory.inflation is not None:
-            return memory
-        return memory._replace(inflation=self.inflation.start(members))
+        if self.inflation is not None and memory.inflation is None:
+            memory = memory._replace(inflation=self.inflation.start(members))
+        if self.surprise is not None and memory.surprise is None:
+            memory = memory._replace(surprise=self.surprise.start(members))
+        return memory
 
     def forget(self, memory: Memory, dt: Tensor) -> Memory:
         """What is left of a memory after dt [...] seconds."""
-        if self.weighting is None or memory.weighting is None:
-            return memory
-        return memory._replace(weighting=self.weighting.forget(memory.weighting, dt))
+        weighting, surprise = memory.weighting, memory.surprise
+        if self.weighting is not None and weighting is not None:
+            weighting = self.weighting.forget(weighting, dt)
+        if self.surprise is not None and surprise is not None:
+            surprise = self.surprise.forget(surprise, dt)
+        return memory._replace(weighting=weighting, surprise=surprise)
 
     def select(self, view: View) -> Update:
         """The update of a view of the model: every part narrows itself."""
         part = sharing(self)
         part.rule = self.rule.select(view)
         part.trust = nn.ModuleList([trust.select(view) for trust in self.trust])  # type: ignore[operator]
-        for name in ("weighting", "localisation", "inflation"):
+        for name in ("surprise", "weighting", "localisation", "inflation"):
             slot = getattr(self, name)
             setattr(part, name, None if slot is None else slot.select(view))
         return part
@@ -117,7 +129,7 @@ class Update(nn.Module):
     @property
     def slots(self) -> Slots:
         """The parts by their places."""
-        return Slots(self.rule, tuple(self.trust), self.weighting, self.localisation, self.inflation)  # type: ignore
+        return Slots(self.rule, self.surprise, tuple(self.trust), self.weighting, self.localisation, self.inflation)  # type: ignore
 
 
 def analyse(slots: Slots, carrier: Carrier, measured: Measured, perturbations: Tensor | None) -> Tensor:
@@ -132,36 +144,61 @@ def analyse(slots: Slots, carrier: Carrier, measured: Measured, perturbations: T
     Returns:
         The log-likelihood [...] of what was measured.
     """
-    rule, trust, weighting, localisation, inflation = slots
+    rule, surprise, trust, weighting, localisation, inflation = slots
     memory, counts, spread, taper = carrier.memory, None, NO_SPREAD, None
-    weights, grown = memory.weighting, memory.inflation
-    if trust:
-        measured, counts = _trusted(trust, carrier, measured)
+    observed = measured.observed
+    weights, grown, felt = memory.weighting, memory.inflation, memory.surprise
+    if surprise is not None or trust:
+        noticed = _noticed(carrier, measured)
+        if surprise is not None:
+            felt, counts = surprise.judge(felt, noticed)
+            observed = _not_rejected(observed, counts)
+        measured, counts = _trusted(surprise, trust, noticed, measured, counts)
     if weighting is not None and weights is not None:
         assert memory.origin is not None
-        seen = Seen(measured.y, measured.observed, counts, measured.rows, carrier.moving, carrier.mean, memory.origin)
+        seen = Seen(measured.y, observed, counts, measured.rows, carrier.moving, carrier.mean, memory.origin)
         weights = weighting.learn(weights, seen)
     if inflation is not None:
         spread, grown = inflation(grown, _share(measured, counts))
     if localisation is not None:
         taper = localisation()
     likelihood = carrier.move(rule, measured, taper, spread, perturbations)
-    if weights is not memory.weighting or grown is not memory.inflation:
-        carrier.memory = Memory(weights, grown, memory.origin)
+    if weights is not memory.weighting or grown is not memory.inflation or felt is not memory.surprise:
+        carrier.memory = Memory(weights, grown, memory.origin, felt)
     return likelihood
 
 
-def _trusted(trust: Sequence[RobustWeights], carrier: Carrier, measured: Measured) -> tuple[Measured, Tensor]:
-    """Values and deviations that deserve belief, and how much each value counts."""
-    observed, variance, mean = measured.observed, carrier.variance(), carrier.expected()
-    y, deviation = measured.y, measured.deviation
+def _not_rejected(observed: Tensor | None, counts: Tensor | None) -> Tensor | None:
+    """What was observed of sensors that count [..., K] more than nothing; None for all."""
+    if counts is None or bool((counts > 0).all()):
+        return observed
+    return counts > 0 if observed is None else observed & (counts > 0)
+
+
+def _noticed(carrier: Carrier, measured: Measured) -> Noticed:
+    """A sample beside what was expected of it."""
+    y, observed = measured.y, measured.observed
     if observed is not None:
         y = torch.where(observed, y, 0)
-    total: Tensor | None = None
+    return Noticed(y, observed, measured.rows, carrier.expected(), carrier.variance(), carrier.mean)
+
+
+def _trusted(
+    surprise: Surprise | None,
+    trust: Sequence[RobustWeights],
+    noticed: Noticed,
+    measured: Measured,
+    total: Tensor | None,
+) -> tuple[Measured, Tensor | None]:
+    """Values and deviations that deserve belief, and how much each value counts; None: all alike."""
+    observed, y, deviation = noticed.observed, noticed.y, measured.deviation
+    if surprise is not None and total is not None:
+        y, deviation = believed(noticed, deviation, total, surprise.stride)
     for weigh in trust:
-        y, deviation, counts = weigh(y, mean, variance, deviation)
+        y, deviation, counts = weigh(y, noticed.expected, noticed.variance, deviation)
         total = counts if total is None else total * counts
-    assert total is not None
+    if total is None:
+        return measured, None
     if observed is not None:
         deviation, total = torch.where(observed, deviation, 0), torch.where(observed, total, 0)
     return measured._replace(y=y, deviation=deviation), total

@@ -1,0 +1,36 @@
+"""A filter whose surprise is calibrated by hand, so strictly that interactions of conftest surprise it a little."""
+
+from __future__ import annotations
+
+import torch
+
+from torch_ebip import InteractionPrimitive, ebip
+from torch_ebip.interaction import Bounds, Doubt, InteractionEnsembleFilter, InteractionSurprise
+from torch_ebip.interaction.surprise import POINTS
+from torch_ebip.interaction.tail import Tail
+
+
+def strict(primitive: InteractionPrimitive, above: float = 0.0, **settings: float) -> InteractionSurprise:
+    """Calibrated with draws: sensors are suspect from about the usual on, or from a level above that."""
+    surprise = InteractionSurprise.of(primitive, **settings)
+    draws = torch.Generator().manual_seed(0)
+    like, S = primitive.weights, surprise.n_sensors
+    usual = 0.5 + torch.rand(POINTS, 2, S, generator=draws, dtype=torch.float64)
+    largest = 0.3 * torch.rand(60, S, generator=draws, dtype=torch.float64) - 0.2 + above
+    largest[:, -1] = torch.nan  # what the robot controls is not shown
+    surprise.know(usual.to(like), largest.to(like))
+    surprise.tail = Tail.fit((torch.rand(60, 1, generator=draws, dtype=torch.float64) - 0.5).to(like))
+    return surprise
+
+
+def cautious(primitive: InteractionPrimitive, above: float = 0.0, **options: object) -> InteractionEnsembleFilter:
+    """A filter with all that `learn` gives it."""
+    filter = ebip(primitive, **options)  # type: ignore[arg-type]
+    filter.analysis.surprise = strict(primitive, above=above)
+    like = primitive.weights
+    levels = (0.8, 1.0, 2.0)
+    filter.doubt = Doubt(
+        like.new_tensor([1.0, 0.8, 0.4]), like.new_tensor([0.0, 0.5, 2.0]), primitive.value_variance, levels
+    )
+    filter.bounds = Bounds.of(primitive)
+    return filter

@@ -1,0 +1,286 @@
+"""Surprise against plain numpy, what it does to an update, and that both of its forms are one."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from tests.conftest import interactions, small_primitive
+from tests.filtering.contract import FilterContract
+from tests.interaction.surprised import cautious, strict
+from tests.interaction.test_ebip import silent
+from torch_ebip import BSplineBasis, EnsembleFilter, LiveFilter, StudentT, ebip
+from torch_ebip.common.draws import seeded
+from torch_ebip.filtering.updates.surprise import Noticed, believed
+from torch_ebip.interaction.surprise import InteractionSurprise
+from torch_ebip.interaction.surprise_memory import ABSURD, ALONE, HERE, LEAST_SAY, MOST, SurpriseMemory, state_of
+
+
+class TestCautious(FilterContract):
+    """Every promise of a filter holds with surprise, doubt and bounds, judging at nearly every sample."""
+
+    def make(self, dtype: torch.dtype = torch.float32) -> EnsembleFilter:
+        return cautious(small_primitive(dtype), n_members=20, weigh=True, robust=StudentT(), context=BSplineBasis(4))
+
+    def make_without_draws(self) -> EnsembleFilter:
+        return silent(cautious(small_primitive(torch.float64), n_members=20, weigh=True, square_root=True))
+
+
+class Oracle:
+    """The class's docstring in float64 numpy, one sample after the other."""
+
+    def __init__(self, surprise: InteractionSurprise) -> None:
+        names = ("mean", "variance", "noise", "usual", "bounds")
+        self.mean, self.variance, self.noise, self.usual, self.bounds = (
+            getattr(surprise, name).double().numpy() for name in names
+        )
+        self.surprise, self.sensor = surprise, surprise.sensor_of_dof.numpy()
+        S = self.usual.shape[-1]
+        self.total, self.samples, self.level, self.last = np.zeros((4, S))
+        self.largest, self.recent = -math.inf, 0.0
+        self.body = float(surprise.tail.quantiles[0, -1])
+
+    def forget(self, dt: float) -> None:
+        keep = math.exp(-dt / self.surprise.window)
+        self.total, self.samples = self.total * keep, self.samples * keep
+        self.recent *= math.exp(-dt / self.surprise.memory)
+
+    def at(self, table: np.ndarray, phase: float) -> np.ndarray:
+        grid = np.linspace(0, 1, len(table))
+        flat = table.reshape(len(table), -1)
+        return np.stack([np.interp(phase, grid, column) for column in flat.T]).reshape(table.shape[1:])
+
+    def judge(self, y, expected, variance, phase: float) -> np.ndarray:
+        """What each sensor counts."""
+        near = (y - expected) ** 2 / (variance + self.noise)
+        far = (y - self.at(self.mean, phase)) ** 2 / (self.at(self.variance, phase) + self.noise)
+        usual = self.at(self.usual, phase)
+        S = usual.shape[-1]
+        for s in range(S):
+            ours = (self.sensor == s) & ~np.isnan(y)
+            if ours.any():
+                u = min(max(near[ours].mean() / usual[0, s], far[ours].mean() / usual[1, s]), ABSURD)
+                self.last[s] = math.log(u)
+                self.total[s] += min(u, MOST * math.exp(self.bounds[1, s]))
+                self.samples[s] += 1
+                self.level[s] = math.log((self.total[s] + 1) / (self.samples[s] + 1))
+        known = self.surprise.known.numpy()
+        voices = [s for s in range(S) if self.samples[s] > HERE and known[s]]
+        excess = (self.level - self.bounds[0]) / (self.bounds[1] - self.bounds[0])
+        middle = max(sorted(excess[voices])[(len(voices) - 1) // 2], 0.0) if voices else 0.0
+        counts = np.ones(S)
+        for s in voices:
+            alone = (self.last[s] - self.bounds[1, s] - math.log(ALONE[0])) / math.log(ALONE[1] / ALONE[0])
+            x = min(max(excess[s] - middle, alone, 0.0), 1.0)
+            counts[s] = 1 - x * x * (3 - 2 * x)
+        if voices and not np.isnan(y).all():
+            say = counts[voices] + LEAST_SAY
+            whole = float((excess[voices] * say).sum() / say.sum())
+            self.largest, self.recent = max(self.largest, whole), max(self.recent, whole - self.body)
+        return counts
+
+
+def conversation(count: int = 14, gaps: bool = True, seed: int = 3):
+    """Samples y, expected, variance [T, D] and phase [T] that surprise now and then."""
+    draws = np.random.default_rng(seed)
+    primitive = small_primitive(torch.float64)
+    phase = np.linspace(-0.05, 1.05, count)
+    path = primitive.basis.project(
+        torch.tensor(phase).clamp(0, 1), primitive.weights.mean(0).expand(count, -1)
+    ).numpy()
+    off = draws.standard_normal((count, 5)) * np.where(np.arange(count) % 4 == 3, 3.0, 0.1)[:, None]
+    y = path + off * np.array([1.0, 0.3, 1.0, 1.0, 1.0])
+    if gaps:
+        y[2, 0], y[5, 2], y[6, :2], y[8] = (math.nan,) * 4
+    y[:, 3:] = math.nan
+    return y, path + 0.05 * draws.standard_normal((count, 5)), draws.uniform(0.001, 0.05, (count, 5)), phase
+
+
+@pytest.mark.parametrize("form", ["tensors", "a batch", "plain numbers"])
+def test_it_is_the_formula(form: str) -> None:
+    """Levels, what sensors count and the whole: of a sequence, of a batch of them, and of the fast twin."""
+    surprise = strict(small_primitive(torch.float64))
+    oracle = Oracle(surprise)
+    y, expected, variance, phase = (torch.tensor(part) for part in conversation(gaps=form != "plain numbers"))
+    memory = surprise.start(torch.zeros(*((2,) if form == "a batch" else ()), 3, 2, dtype=torch.float64))
+    hand = torch.tensor([0, 1, 2])
+    less = 0
+    for t in range(len(y)):
+        if t:
+            oracle.forget(0.05)
+            memory = surprise.forget(memory, torch.tensor(0.05, dtype=torch.float64))
+        wanted = oracle.judge(y[t].numpy(), expected[t].numpy(), variance[t].numpy(), float(phase[t]))
+        moving = torch.stack([phase[t], phase[t]])
+        if form == "plain numbers":
+            with torch.no_grad():
+                noticed = Noticed(y[t, hand], None, hand, expected[t, hand], variance[t, hand], moving)
+                memory, counts = surprise.judge(memory, noticed)
+        else:
+            parts = (y[t].nan_to_num(), ~y[t].isnan(), None, expected[t], variance[t], moving)
+            if form == "a batch":
+                parts = tuple(None if part is None else torch.stack([part, part]) for part in parts)
+            memory, counts = surprise.judge(memory, Noticed(*parts))
+        one = SurpriseMemory(*(part[0] for part in memory)) if form == "a batch" else memory
+        np.testing.assert_allclose(one.counts, wanted, atol=1e-12)
+        np.testing.assert_allclose(one.level, oracle.level, atol=1e-12)
+        np.testing.assert_allclose(
+            [float(one.largest), float(one.recent)], [oracle.largest, oracle.recent], atol=1e-12
+        )
+        assert (counts is None) == bool((wanted == 1).all())
+        if counts is not None:
+            less += 1
+            each = counts[0] if form == "a batch" else counts
+            np.testing.assert_allclose(each[:3], wanted[surprise.sensor_of_dof[:3].numpy()], atol=1e-12)
+    assert less > 3
+    assert (surprise._single is not None) == (form == "plain numbers")
+
+
+def test_familiarity_is_the_chance_of_the_largest_so_far() -> None:
+    surprise = strict(small_primitive())
+    memory = surprise.start(torch.zeros(2, 2))
+    assert float(surprise.familiarity(memory)) == 1.0
+    largest = torch.tensor([-0.49, 0.0, 0.3, 1.0])
+    said = surprise.familiarity(SurpriseMemory(torch.zeros(4, 3, 5), torch.stack([largest] * 3, -1)))
+    assert (said.diff() < 0).all()
+    tail = surprise.tail
+    assert abs(float(said[1]) - 0.5) < 0.1
+    beyond = 0.2 * math.exp(-(1.0 - float(tail.quantiles[0, -1])) / float(tail.length))
+    assert float(said[3]) == pytest.approx(beyond, rel=1e-4)
+
+
+def test_without_calibration_nobody_is_judged_and_nothing_is_known() -> None:
+    primitive = small_primitive()
+    plain, listening = ebip(primitive, square_root=True), ebip(primitive, square_root=True)
+    listening.analysis.surprise = InteractionSurprise.of(primitive)
+    y = torch.where(primitive.layout.controlled, torch.nan, interactions(2, seed=5)[1])
+    ours, theirs = (f(y, generator=seeded(0)) for f in (listening, plain))
+    assert torch.equal(ours.state.members, theirs.state.members)
+    assert ours.familiarity.isnan().all()
+    assert theirs.familiarity is None
+    assert (ours.counts == 1).all()
+    assert math.isnan(float(plain.familiarity(theirs.state)))
+
+
+def test_what_is_rejected_was_not_measured() -> None:
+    """Within rounding: not by the state, not by the evidence, not by inflation."""
+    primitive = small_primitive(torch.float64)
+    filter = cautious(primitive, square_root=True, weigh=True, inflation=1.02)
+    state = filter.initial_state()
+    row = interactions(2, seed=5, dtype=torch.float64)[1][0]
+    state, _ = filter.update(state, torch.where(primitive.layout.controlled, torch.nan, row))
+    state = filter.predict(state, 1 / 30)
+    mad, gone = row.clone(), row.clone()
+    mad[0], gone[:2] = 40.0, torch.nan
+    seen = ~primitive.layout.controlled
+    ours, _ = filter.update(state, mad, seen)
+    theirs, _ = filter.update(state, gone, seen & ~gone.isnan())
+    assert [state_of(float(c)) for c in ours.memory.surprise.counts] == ["rejected", *["ok"] * 2]
+    torch.testing.assert_close(ours.members, theirs.members, atol=1e-7, rtol=0)
+    torch.testing.assert_close(ours.weights, theirs.weights, atol=1e-7, rtol=0)
+
+
+@pytest.mark.parametrize("robust", [None, StudentT()])
+def test_a_sensor_comes_back_when_it_agrees_whatever_robust_weights_hide(robust: StudentT | None) -> None:
+    primitive = small_primitive()
+    honest = 100 * primitive.residual_variance
+    filter = cautious(primitive, above=1.5, square_root=True, robust=robust, residual_variance=honest)
+    y = torch.where(primitive.layout.controlled, torch.nan, interactions(3, seed=5)[1].clone())
+    y[5:12, :2] += 3.0
+    counts = filter(y, generator=seeded(0)).counts[:, 0]
+    assert (counts[5:12] < 0.01).all()
+    assert (counts[24:] > 0.5).all()  # less than half a second later
+
+
+def test_robust_weights_do_not_change_what_surprises() -> None:
+    """They are asked afterwards: the first sample that they hide surprises as much."""
+    primitive = small_primitive()
+    levels = []
+    for robust in (None, StudentT(1.0)):
+        filter = cautious(primitive, square_root=True, robust=robust)
+        state, _ = filter.update(filter.initial_state(), torch.tensor([9.0, 9.0, 0.1, math.nan, math.nan]))
+        levels.append(state.memory.surprise.level)
+    assert torch.equal(*levels)
+
+
+def test_what_counts_less_moves_the_mean_less_and_smoothly() -> None:
+    noticed = Noticed(*torch.randn(4, 3, dtype=torch.float64).abs()[:1], None, None, *torch.rand(2, 3).double(), None)
+    deviation = torch.rand(3, dtype=torch.float64) + 0.1
+    counts = torch.tensor([0.3, 0.9, 1.0], dtype=torch.float64, requires_grad=True)
+    y, wider = believed(noticed, deviation, counts)
+    gain = noticed.variance / (noticed.variance + deviation.square())
+    less = noticed.variance / (noticed.variance + wider.square())
+    torch.testing.assert_close(less, gain * counts)
+    assert torch.equal(y, noticed.y)
+    assert float(wider[2]) == float(deviation[2])
+    assert torch.autograd.gradcheck(
+        lambda c: believed(noticed, deviation, c)[1][:2], counts.detach().requires_grad_()
+    )
+    none = believed(noticed, deviation, torch.zeros(3, dtype=torch.float64))
+    assert torch.equal(none[0], noticed.expected)
+    assert (none[1] > 1e4 * deviation).all()
+
+
+def test_live_and_dense_and_whole_sequences_say_the_same() -> None:
+    primitive = small_primitive()
+    filter = cautious(primitive, square_root=True, weigh=True)
+    y = torch.where(primitive.layout.controlled, torch.nan, interactions(3, seed=5)[2])
+    y[8:14, 2] += 2.0
+    with torch.no_grad():
+        dense, span = (filter(y, generator=seeded(0), engine=engine) for engine in ("dense", "span"))
+    live = LiveFilter(filter, generator=seeded(0))
+    for t, row in enumerate(y):
+        if t:
+            live.predict()
+        live.update(row)
+        assert float(live.familiarity) == pytest.approx(float(span.familiarity[t]), abs=1e-5)
+        torch.testing.assert_close(live.counts, span.counts[t], atol=1e-4, rtol=0)
+    torch.testing.assert_close(dense.surprise, span.surprise, atol=1e-4, rtol=0)
+    torch.testing.assert_close(dense.counts, span.counts, atol=1e-3, rtol=0)
+    assert float(span.familiarity[-1]) < 0.5
+    assert float(filter.familiarity(span.state)) == float(span.familiarity[-1])
+
+
+def test_a_snapshot_holds_it_and_a_copy_of_the_filter_works() -> None:
+    primitive = small_primitive()
+    live = LiveFilter(cautious(primitive, square_root=True), generator=seeded(0))
+    row = torch.where(primitive.layout.controlled, torch.nan, interactions(3, seed=5)[2][0])
+    live.update(row)
+    kept = live.save()
+    said = []
+    for _ in range(2):
+        live.load(kept)
+        live.predict()
+        live.update(row + 1.0)
+        said.append([*live.carrier.memory.surprise, live.phase])
+    assert all(torch.equal(a, b) for a, b in zip(*said, strict=True))
+    assert not torch.equal(said[0][0], kept.memory.surprise.sensors)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"suspect": 0.0}, "suspect is a chance, between 0 and 1"),
+        ({"rejected": 1.0}, "rejected is a chance, between 0 and 1"),
+        ({"suspect": math.nan}, "suspect"),
+        ({"suspect": 0.5}, r"suspect must be at most 0\.2"),
+        ({"suspect": 0.01, "rejected": 0.02}, "rejected less than suspect"),
+        ({"window": 0.0}, "window"),
+        ({"memory": -1.0}, "memory"),
+    ],
+)
+def test_bad_settings_are_named(settings: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        InteractionSurprise.of(small_primitive(), **settings)
+
+
+def test_one_of_other_dofs_is_refused() -> None:
+    model = ebip(small_primitive()).model
+    some = model.view(torch.tensor([True, True, True, False, False]))
+    part = InteractionSurprise.of(small_primitive()).select(some)
+    with pytest.raises(ValueError, match="the surprise is for 3 DoFs, the model has 5"):
+        part.check(model)
+    with pytest.raises(ValueError, match=r"mean and variance must be \[P, 2\]"):
+        InteractionSurprise(torch.zeros(4, 3), torch.zeros(4, 3), torch.ones(2), torch.zeros(2, dtype=torch.long))

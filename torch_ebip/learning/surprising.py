@@ -1,0 +1,182 @@
+"""How surprised a filter is by interactions that it should know: from which level on that says something.
+
+Interactions are filtered by ensembles of others, whole and at their full rate, as a session would; nobody is judged
+then. What was noticed is kept, and judged afterwards: first what is usual at a phase, then how large a level becomes
+in a whole interaction, sensor by sensor, then the same of all together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torch_ebip.common.ambient import without_autocast
+from torch_ebip.common.brief import brief
+from torch_ebip.common.modules import sharing
+from torch_ebip.filtering.updates.surprise import Noticed
+from torch_ebip.interaction.filter_kinds import InteractionEnsembleFilter
+from torch_ebip.interaction.primitive import InteractionPrimitive
+from torch_ebip.interaction.surprise import POINTS, InteractionSurprise
+from torch_ebip.interaction.surprise_memory import SurpriseMemory
+from torch_ebip.interaction.tail import FEWEST, Tail
+from torch_ebip.learning.held_out import HeldOut
+from torch_ebip.learning.ranks import Ranks
+
+MOST = 200
+"""Interactions that decide, at most."""
+SMOOTH = 0.05
+"""Phase over which what is usual is smoothed, a standard deviation."""
+LEAST_USUAL = 0.05
+"""Of a square, as a share of its mean over all phases."""
+
+
+class Heard(NamedTuple):
+    """A sample of some interactions as it was noticed, or a time that passed.
+
+    Attributes:
+        by: the surprise of the DoFs that are shown.
+        noticed: the sample, [B, K]; None: time passed.
+        dt: [], s; None: a sample.
+    """
+
+    by: InteractionSurprise
+    noticed: Noticed | None
+    dt: Tensor | None
+
+    def __repr__(self) -> str:
+        return brief(self)
+
+
+Conversation = tuple[list[Heard], int]
+"""What was heard of so many interactions."""
+
+
+class _Listener(InteractionSurprise):
+    """Keeps what it is asked to judge, and judges nobody."""
+
+    heard: list[Heard]
+
+    def forget(self, memory: SurpriseMemory, dt: Tensor) -> SurpriseMemory:
+        """Time passes."""
+        self.heard.append(Heard(self, None, dt))
+        return memory
+
+    def judge(self, memory: SurpriseMemory, noticed: Noticed) -> tuple[SurpriseMemory, Tensor | None]:
+        """A copy: carriers use their buffers again."""
+        kept = Noticed(*(part if part is None else part.clone() for part in noticed))  # type: ignore[arg-type]
+        self.heard.append(Heard(self, kept, None))
+        return memory, None
+
+
+@without_autocast
+@torch.no_grad()
+def learn_surprise(
+    held_out: HeldOut, filter: InteractionEnsembleFilter, interactions: Tensor, **settings: float
+) -> tuple[InteractionSurprise | None, dict[str, Any]]:
+    """What the filter's `InteractionSurprise` should be, and what the report says of it.
+
+    Args:
+        held_out: the demonstrations.
+        filter: that will be asked; without a surprise.
+        interactions: int64 [B], that decide.
+        settings: of `InteractionSurprise`.
+
+    Returns:
+        None where there are fewer than `FEWEST` interactions.
+    """
+    primitive = held_out.task.primitive
+    surprise = InteractionSurprise.of(primitive, **settings)
+    if len(interactions) < FEWEST:
+        return None, {}
+    # Several sets of sensors say several times something of the same interaction.
+    some = interactions[: max(FEWEST, MOST // len(held_out.task.subsets))]
+    conversations = listen(held_out, filter, some, primitive)
+    usual = _usual(surprise, conversations, held_out.ranks)
+    surprise.usual.copy_(usual)
+    largest, _ = _largest(surprise, conversations, held_out.ranks)
+    surprise.know(usual, largest)
+    surprise.tail = Tail.fit(_largest(surprise, conversations, held_out.ranks)[1].unsqueeze(-1))
+    names = [name for name, known in zip(primitive.layout.names, surprise.known.tolist(), strict=True) if known]
+    return surprise, {
+        "interactions": len(some),
+        "sensors": names,
+        "chances": {"suspect": surprise.suspect, "rejected": surprise.rejected},
+        "largest": [round(value, 4) for value in surprise.tail.quantiles[0].tolist()],
+    }
+
+
+def listen(
+    held_out: HeldOut, filter: InteractionEnsembleFilter, interactions: Tensor, primitive: InteractionPrimitive
+) -> list[Conversation]:
+    """What is noticed of interactions int64 [B], by portions, with how many each has."""
+    whole = HeldOut.__new__(HeldOut)
+    whole.__dict__ |= held_out.__dict__
+    whole.settings = replace(held_out.settings, thinning=1)
+    listener = _Listener.of(primitive)
+    assert isinstance(listener, _Listener)
+    hearing = sharing(filter)
+    hearing.analysis = sharing(filter.analysis)
+    hearing.analysis.surprise = listener
+    found = []
+    end = torch.ones(1, device="cpu")
+    for subset in held_out.task.subsets.values():
+        for shown in whole.portions(interactions, subset, end):
+            heard: list[Heard] = []
+            listener.heard = heard
+            whole.filter(hearing, shown, -1)
+            found.append((heard, len(shown.interactions)))
+    return found
+
+
+def _usual(surprise: InteractionSurprise, conversations: list[Conversation], ranks: Ranks) -> Tensor:
+    """[P, 2, S], means of both squares at the phases of the grid, smoothed."""
+    sums = surprise.usual.new_zeros(2, *surprise.usual.shape).double()
+    for heard, _ in conversations:
+        for by, noticed, _ in heard:
+            if noticed is None:
+                continue
+            squares, here = by.squares(noticed)
+            place = (noticed.mean[..., 0].clamp(0, 1) * (POINTS - 1)).round().long()
+            weight = here.unsqueeze(-2).expand_as(squares).double()
+            sums[0].index_add_(0, place, squares.double() * weight)
+            sums[1].index_add_(0, place, weight)
+    ranks.add_up([sums])
+    grid = torch.linspace(0, 1, POINTS, dtype=sums.dtype, device=sums.device)
+    near = torch.exp(-0.5 * ((grid - grid[:, None]) / SMOOTH).square())
+    total, counts = torch.einsum("pq,nqks->npks", near, sums)
+    overall = sums[0].sum(0) / sums[1].sum(0).clamp(min=1)
+    overall = torch.where(overall > 0, overall, 1)
+    return torch.maximum(total / counts.clamp(min=1e-9), LEAST_USUAL * overall).to(surprise.usual)
+
+
+def _largest(surprise: InteractionSurprise, conversations: list[Conversation], ranks: Ranks) -> tuple[Tensor, Tensor]:
+    """The largest level of each sensor [B, S], NaN where it was not shown, and the largest of the whole [B]."""
+    found = [_largest_of(surprise, heard, count) for heard, count in conversations]
+    everyone = [pair for rank in ranks.gather([[part.cpu() for part in pair] for pair in found]) for pair in rank]
+    levels, whole = (torch.cat(parts).to(surprise.usual) for parts in zip(*everyone, strict=True))
+    return levels, whole
+
+
+def _largest_of(surprise: InteractionSurprise, heard: list[Heard], count: int) -> tuple[Tensor, Tensor]:
+    """The same of one conversation about so many interactions."""
+    memory = surprise.start(surprise.noise.new_zeros(count, 1, 1))
+    levels, whole = torch.full_like(memory.level, -torch.inf), memory.largest
+    parts: dict[int, InteractionSurprise] = {}
+    for by, noticed, dt in heard:
+        if noticed is None:
+            assert dt is not None
+            memory = surprise.forget(memory, dt)
+            continue
+        if id(by) not in parts:  # what listened has the DoFs that were shown, but nothing learned
+            parts[id(by)] = part = sharing(surprise)
+            for name in ("mean", "variance", "noise", "sensor_of_dof"):
+                part.register_buffer(name, getattr(by, name))
+            part.stride = by.stride
+        memory, here = parts[id(by)].update(memory, noticed)
+        levels = torch.where(here, torch.maximum(levels, memory.level), levels)
+        now, _ = parts[id(by)].verdict(memory)
+        whole = torch.where(here.any(-1), torch.maximum(whole, now), whole)
+    return torch.where(levels.isinf(), torch.nan, levels), whole
