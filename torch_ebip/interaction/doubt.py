@@ -18,7 +18,7 @@ from torch_ebip.filtering.protocols import View
 from torch_ebip.interaction.forecast import Forecast
 from torch_ebip.interaction.readout import Lead, hats, moved, widths_of
 
-LEVELS = (1.0, 1.7, 2.5, 4.0, 6.0)
+LEVELS = (1.3, 2.0, 3.0, 4.5, 6.0)
 """Of doubt, -log10 of the chance of such a surprise: below the first of them, one in twenty, there is none."""
 ELSEWHERE = 0.05
 """Share of the variance over all phases."""
