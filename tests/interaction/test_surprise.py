@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 
 import numpy as np
@@ -257,6 +258,49 @@ def test_a_snapshot_holds_it_and_a_copy_of_the_filter_works() -> None:
         said.append([*live.carrier.memory.surprise, live.phase])
     assert all(torch.equal(a, b) for a, b in zip(*said, strict=True))
     assert not torch.equal(said[0][0], kept.memory.surprise.sensors)
+
+
+def test_who_is_not_known_has_no_say() -> None:
+    """A sensor that was never shown in calibration says nothing of familiarity, in either form."""
+    primitive = small_primitive()
+    surprise = strict(primitive)
+    surprise.known[1] = False
+    gaze = torch.tensor([2])
+    parts = [part[:1] for part in torch.rand(3, 1)]
+    noticed = Noticed(100 + parts[0], None, gaze, *parts[1:], torch.tensor([0.3, 1.0]))
+    start = surprise.start(torch.zeros(3, 2))
+    with torch.no_grad():
+        plain, _ = surprise.judge(start, noticed)
+    tensors, counts = surprise.judge(start, noticed._replace(observed=torch.tensor([True])))
+    assert counts is None
+    for memory in (plain, tensors):
+        assert float(surprise.familiarity(memory)) == 1.0
+        assert (memory.counts == 1).all()
+    torch.testing.assert_close(plain.sensors, tensors.sensors)
+
+
+def test_an_absurd_value_of_one_sensor_reaches_no_other() -> None:
+    primitive = small_primitive()
+    surprise = strict(primitive)
+    seen = torch.tensor([True, True, True, False, False])
+    y = torch.tensor([1e30, 0.0, 0.1, 0.0, 0.0])
+    noticed = Noticed(y, seen, None, torch.zeros(5), torch.ones(5), torch.tensor([0.3, 1.0]))
+    memory, counts = surprise.judge(surprise.start(torch.zeros(3, 2)), noticed)
+    assert counts[:2].tolist() == [0.0, 0.0]
+    assert memory.sensors.isfinite().all()
+
+
+def test_copies_have_tables_of_their_own() -> None:
+    """What is kept for rows of a live filter is not looked up for others that lie where those did."""
+    primitive = small_primitive()
+    filter = cautious(primitive, square_root=True)
+    live = LiveFilter(filter)
+    live.update(torch.where(primitive.layout.controlled, torch.nan, interactions(3, seed=5)[2][0]))
+    judge = live.carrier._update.surprise
+    assert judge._single is not None
+    again = copy.deepcopy(judge)
+    assert again._single is None
+    assert again._kept is None
 
 
 @pytest.mark.parametrize(

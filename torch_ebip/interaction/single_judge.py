@@ -61,7 +61,7 @@ class SingleJudge:
     def __call__(self, memory: SurpriseMemory, noticed: Noticed) -> tuple[Tensor, Tensor, Tensor | None]:
         """Sensors and together of a `SurpriseMemory` after a sample, and what sensors count [S]; None: all alike."""
         table = self._tables.get(id(noticed.rows))
-        if table is None:
+        if table is None or table[0] is not noticed.rows:
             table = self._made(noticed.rows)
         _, levels, rises, usual, usual_rises, sensor, count = table
         place = min(max(noticed.mean.tolist()[0], 0.0), 1.0) * self._last
@@ -86,8 +86,7 @@ class SingleJudge:
         for s, (total, samples, level, _, last) in enumerate(memory.sensors.tolist()):
             if count[s]:
                 one, other = usual[s] + part * usual_rises[s], usual[S + s] + part * usual_rises[S + s]
-                multiple = max(near[s] / one, far[s] / other) / count[s]
-                multiple = min(multiple, ABSURD)
+                multiple = min(max(near[s] / one, far[s] / other) / count[s], ABSURD)
                 last = math.log(max(multiple, LEAST_SAY))
                 total, samples = total + min(multiple, self._most[s]) * stride, samples + stride
                 level = math.log((total + 1) / (samples + 1))
@@ -108,9 +107,11 @@ class SingleJudge:
             say += counts + LEAST_SAY
             whole += excess * (counts + LEAST_SAY)
         whole = whole / say if say else 0.0
-        _, largest, recent = memory.together.tolist()
+        last_whole, largest, recent = memory.together.tolist()
         like = memory.sensors
-        together = [whole, max(largest, whole), max(recent, whole - self._body)]
+        if excesses:
+            last_whole, largest, recent = whole, max(largest, whole), max(recent, whole - self._body)
+        together = [last_whole, largest, recent]
         sensors = torch.tensor(found, dtype=like.dtype)
         return sensors, torch.tensor(together, dtype=like.dtype), sensors[:, 3] if less else None
 

@@ -8,6 +8,7 @@ come from interactions left out (see `torch_ebip.learning.surprising`) and from 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -99,7 +100,7 @@ class InteractionSurprise(Surprise):
 
         Args:
             primitive: of the demonstrations.
-            settings: ``window``, ``memory`` (default: as long as a demonstration), ``suspect``, ``rejected``.
+            settings: ``window``, ``memory`` (default: twice as long as a demonstration), ``suspect``, ``rejected``.
         """
         weights, basis = primitive.weights, primitive.basis
         phase = torch.linspace(0, 1, POINTS, dtype=weights.dtype, device=weights.device)
@@ -165,23 +166,22 @@ class InteractionSurprise(Surprise):
 
     def forget(self, memory: SurpriseMemory, dt: Tensor) -> SurpriseMemory:
         """See `Surprise.forget`, over dt [...] s."""
-        if self._kept is None or self._kept[0] is not dt:
+        kept = self._kept  # another thread may exchange it
+        if kept is None or kept[0] is not dt:
             one = torch.ones_like(dt)
             window, slowly = torch.exp(-dt / self.window), torch.exp(-dt / self.memory)
-            self._kept = (
-                dt,
-                torch.stack([window, window, one, one, one], -1).unsqueeze(-2),
-                torch.stack([one, one, slowly], -1),
-            )
-        _, sensors, together = self._kept
+            sensors = torch.stack([window, window, one, one, one], -1).unsqueeze(-2)
+            self._kept = kept = dt, sensors, torch.stack([one, one, slowly], -1)
+        _, sensors, together = kept
         return SurpriseMemory(memory.sensors * sensors, memory.together * together)
 
     def judge(self, memory: SurpriseMemory, noticed: Noticed) -> tuple[SurpriseMemory, Tensor | None]:
         """See `Surprise.judge`: a memory and a sample that was noticed."""
         if self.tail is not None and serves(memory, noticed):
-            if self._single is None or self._single.changed(self):
-                self._single = SingleJudge(self)
-            sensors, together, counts = self._single(memory, noticed)
+            single = self._single
+            if single is None or single.changed(self):
+                self._single = single = SingleJudge(self)
+            sensors, together, counts = single(memory, noticed)
             memory = SurpriseMemory(sensors, together)
         else:
             memory, seen = self.update(memory, noticed)
@@ -190,7 +190,7 @@ class InteractionSurprise(Surprise):
             whole, counts = self.verdict(memory)
             beyond = (whole - self.tail.quantiles[0, -1]).clamp(min=0)
             last, largest, recent = memory.together.unbind(-1)
-            some = seen.any(-1)
+            some = seen.any(-1) & self.voices(memory).any(-1)
             together = torch.stack(
                 [
                     torch.where(some, whole, last),
@@ -237,7 +237,7 @@ class InteractionSurprise(Surprise):
         mean, variance = self._at(moments, noticed.mean[..., 0]).chunk(2, -1)
         near = (y - noticed.expected).square() / (noticed.variance + noise)
         far = (y - mean).square() / (variance + noise)
-        both = torch.stack([near, far], -2)
+        both = torch.stack([near, far], -2).clamp(max=ABSURD)  # infinity times nothing would reach other sensors
         member = torch.nn.functional.one_hot(sensors, self.n_sensors).to(both)
         if observed is None:
             count = member.sum(0).expand(*both.shape[:-2], -1)
@@ -262,9 +262,13 @@ class InteractionSurprise(Surprise):
             return torch.zeros_like(memory.recent)
         return (memory.recent / self.tail.length[0] - math.log(1 - BODY[-1])) / math.log(10)
 
+    def voices(self, memory: SurpriseMemory) -> Tensor:
+        """bool [..., S], which sensors have a say in a memory: those that are known, and were here lately."""
+        return self.known & (memory.sensors[..., 1] > HERE)
+
     def verdict(self, memory: SurpriseMemory) -> tuple[Tensor, Tensor]:
         """The whole [...], and what sensors count [..., S], of a memory."""
-        voices, level = self.known & (memory.sensors[..., 1] > HERE), memory.level
+        voices, level = self.voices(memory), memory.level
         low, high = self.bounds
         excess = (level - low) / (high - low)
         ordered = torch.where(voices, excess, torch.inf).sort(-1).values
@@ -288,6 +292,10 @@ class InteractionSurprise(Surprise):
         low, high = table.index_select(0, index), table.index_select(0, index + 1)
         part = (place - cell).reshape(-1, 1)
         return torch.lerp(low, high, part).view(*phase.shape, -1)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Copies and pickles have nothing kept."""
+        return {**self.__dict__, "_kept": None, "_single": None}
 
     def meant(self) -> str:
         """What its tensors mean, see `Meaning`."""
