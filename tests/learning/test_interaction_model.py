@@ -274,7 +274,7 @@ def test_foreign_cut_off_and_later_files_are_named(tmp_path: Path) -> None:
     flipped = bytearray(content)
     flipped[-100] ^= 1
     (tmp_path / "flipped").write_bytes(bytes(flipped))
-    (tmp_path / "later").write_bytes(content.replace(b'"version":"1"', b'"version":"7"'))
+    (tmp_path / "later").write_bytes(content.replace(b'"version":"2"', b'"version":"7"'))
     messages = {
         "foreign": "tensors of something else",
         "cut": "cut off or damaged",
