@@ -281,7 +281,7 @@ def test_foreign_cut_off_and_later_files_are_named(tmp_path: Path) -> None:
         "head": "cut off in its header",
         "pickle": "not a model",
         "flipped": "damaged model",
-        "later": "model format '7', this torch_ebip reads up to 1",
+        "later": "model format '7', this torch_ebip reads up to 2",
     }
     for name, message in messages.items():
         with pytest.raises(ValueError, match=f"{name}: .*{message}"):

@@ -18,6 +18,7 @@ from torch_ebip.common.arguments import as_number
 from torch_ebip.filtering.model import StateSpace
 from torch_ebip.filtering.protocols import View
 from torch_ebip.filtering.updates.surprise import Noticed, Surprise
+from torch_ebip.interaction.grid import between
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.interaction.single_judge import SingleJudge, serves
 from torch_ebip.interaction.surprise_memory import ABSURD, ALONE, HERE, LEAST_SAY, MOST, SurpriseMemory
@@ -223,7 +224,7 @@ class InteractionSurprise(Surprise):
     def multiples(self, noticed: Noticed) -> tuple[Tensor, Tensor]:
         """Multiples of what is usual, [..., S], of what was noticed, and 1 or 0 for whether a sensor is here."""
         squares, here = self.squares(noticed)
-        usual = self._at(self.usual.flatten(1), noticed.mean[..., 0])
+        usual = between(self.usual.flatten(1), noticed.mean[..., 0])
         return (squares / usual.view_as(squares)).amax(-2).clamp(max=ABSURD) * here, here
 
     def squares(self, noticed: Noticed) -> tuple[Tensor, Tensor]:
@@ -234,7 +235,7 @@ class InteractionSurprise(Surprise):
         if rows is not None:
             moments = torch.cat([self.mean[:, rows], self.variance[:, rows]], -1)
             noise, sensors = noise[rows], sensors[rows]
-        mean, variance = self._at(moments, noticed.mean[..., 0]).chunk(2, -1)
+        mean, variance = between(moments, noticed.mean[..., 0]).chunk(2, -1)
         near = (y - noticed.expected).square() / (noticed.variance + noise)
         far = (y - mean).square() / (variance + noise)
         both = torch.stack([near, far], -2).clamp(max=ABSURD)  # infinity times nothing would reach other sensors
@@ -282,16 +283,6 @@ class InteractionSurprise(Surprise):
         say = voices * (counts + LEAST_SAY)
         whole = (torch.where(voices, excess, 0) * say).sum(-1) / say.sum(-1).clamp(min=LEAST_SAY)
         return whole, counts
-
-    def _at(self, table: Tensor, phase: Tensor) -> Tensor:
-        """Rows of a table [P, k], linearly between its phases, at a phase [...]: [..., k]."""
-        last = len(table) - 1
-        place = phase.clamp(0, 1) * last
-        cell = place.detach().floor().clamp(max=last - 1)
-        index = cell.long().reshape(-1)
-        low, high = table.index_select(0, index), table.index_select(0, index + 1)
-        part = (place - cell).reshape(-1, 1)
-        return torch.lerp(low, high, part).view(*phase.shape, -1)
 
     def __getstate__(self) -> dict[str, Any]:
         """Copies and pickles have nothing kept."""
