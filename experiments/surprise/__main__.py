@@ -27,7 +27,7 @@ from experiments.results import Values, summarise
 from experiments.run_folder import RunFolder, save_figure
 from experiments.surprise.figure import surprise_figure
 from experiments.surprise.lies import TRUTHLESS, lies
-from experiments.surprise.measure import ALARM, HALF, SHARES, Noticed, auc, measure, scores
+from experiments.surprise.measure import ALARM, HALF, SHARES, Noticed, auc, measure, scores, unit_of
 from experiments.surprise.reaches import STRANGE, reaches
 from torch_ebip import Demonstrations, Forecast, InteractionModel, InteractionPrimitive, learn
 from torch_ebip.interaction import DemonstrationTable
@@ -129,8 +129,7 @@ def main(arguments: list[str] | None = None) -> None:
                 noticed[name] = seen
         if true:
             end = torch.stack([trajectory[-1] for trajectory in truth])[:, known.layout.controlled]
-            unit = known.layout.modalities[-1].unit
-            for cell, arrays in scores("mean", mean_of(model, len(end)), end, name, unit).items():
+            for cell, arrays in scores("mean", mean_of(model, len(end)), end, name, unit_of(known.layout)).items():
                 values[cell].update(arrays)
     usual = noticed["familiar"]
     names = [*known.layout.names, "the whole"]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from experiments.results import Cell, Values
-from torch_ebip import Demonstrations, Forecast, InteractionModel
+from torch_ebip import Demonstrations, Forecast, InteractionModel, Layout
 from torch_ebip.common.draws import seeded
 from torch_ebip.learning.metrics import Z95
 
@@ -79,7 +79,7 @@ def _portion(
     trace = filter(torch.where(observed, y, torch.nan), observed, generator=draws, keep=steps, project=False)
     forecast = filter.forecast(trace.kept, 1.0).select(layout.controlled)
     end = torch.stack([trajectory[-1] for trajectory in truth])[:, layout.controlled]
-    values = scores(name, forecast, end, subset, layout.modalities[-1].unit)
+    values = scores(name, forecast, end, subset, unit_of(layout))
     if trace.familiarity is None or trace.counts is None:
         return values, None
     within = torch.arange(y.shape[1]) < said.lengths.unsqueeze(-1)
@@ -107,6 +107,11 @@ def scores(name: str, forecast: Forecast, end: Tensor, subset: str, unit: str) -
         for (metric, its), value in found.items()
         for k, share in enumerate(SHARES)
     }
+
+
+def unit_of(layout: Layout) -> str:
+    """Of what is forecast; several where it has several."""
+    return ", ".join(dict.fromkeys(m.unit for m in layout.modalities if m.controlled))
 
 
 def auc(strange: NDArray[np.float64], familiar: NDArray[np.float64]) -> float:
