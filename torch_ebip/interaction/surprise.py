@@ -38,7 +38,7 @@ class InteractionSurprise(Surprise):
 
     A sensor is suspect above the level that demonstrations left out exceed with the chance ``suspect`` in a whole
     interaction, and rejected above that of ``rejected``; between them it counts less and less. What most sensors are
-    surprised by is no fault of one: the excess of the middle one is taken off. Alone a sensor is rejected at `ALONE`.
+    surprised by is no fault of one: the excess of the middle one is taken off. A sample beyond `ALONE` always is.
 
     Args:
         mean: [P, D], of the demonstrations at phases evenly from 0 to 1, units of the DoFs.

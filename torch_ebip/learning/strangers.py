@@ -7,6 +7,7 @@ wide it should be, by how much the filter was surprised.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -98,8 +99,7 @@ def astray(demonstrations: Demonstrations, sensors: Tensor, generator: torch.Gen
 
 def strangers(held_out: HeldOut, demonstrations: Demonstrations) -> Iterator[HeldOut]:
     """Demonstrations, N of them, as strangers to those who are asked to filter them."""
-    unlike = HeldOut.__new__(HeldOut)
-    unlike.__dict__ |= held_out.__dict__
+    unlike = copy.copy(held_out)
     unlike.partition = Unlike(held_out.partition, unlikeness(held_out.task.primitive))
     yield unlike
     for speed in SPEEDS:

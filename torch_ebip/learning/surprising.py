@@ -7,6 +7,7 @@ in a whole interaction, sensor by sensor, then the same of all together.
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -112,8 +113,7 @@ def listen(
     held_out: HeldOut, filter: InteractionEnsembleFilter, interactions: Tensor, primitive: InteractionPrimitive
 ) -> list[Conversation]:
     """What is noticed of interactions int64 [B], by portions, with how many each has."""
-    whole = HeldOut.__new__(HeldOut)
-    whole.__dict__ |= held_out.__dict__
+    whole = copy.copy(held_out)
     whole.settings = replace(held_out.settings, thinning=1)
     listener = _Listener.of(primitive)
     assert isinstance(listener, _Listener)

@@ -6,7 +6,7 @@ It is asked before robust weights are, of the innovations as they are: what thos
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,18 +16,6 @@ from torch_ebip.common.modules import sharing
 from torch_ebip.filtering.protocols import View
 from torch_ebip.filtering.updates.part import Part
 from torch_ebip.filtering.updates.trust import LEAST
-
-
-class Surprised(Protocol):
-    """What a surprise remembers: a NamedTuple of tensors, among them how it judged last."""
-
-    @property
-    def level(self) -> Tensor:
-        """[..., S], how surprising each of S sensors is."""
-
-    @property
-    def counts(self) -> Tensor:
-        """[..., S], in [0, 1], what each of them counts."""
 
 
 class Noticed(NamedTuple):
@@ -54,7 +42,11 @@ class Noticed(NamedTuple):
 
 
 class Surprise(Part, ABC):
-    """Judges sensors by their innovations; a subclass says how."""
+    """Judges S sensors by their innovations; a subclass says how.
+
+    What it remembers is a NamedTuple of tensors that gives, among others, ``level`` [..., S], how surprising each
+    sensor is, and ``counts`` [..., S], in [0, 1], what each of them counts.
+    """
 
     def __init__(self) -> None:
         super().__init__()
