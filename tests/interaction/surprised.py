@@ -7,7 +7,6 @@ import torch
 from torch_ebip import InteractionPrimitive, ebip
 from torch_ebip.interaction import Bounds, Doubt, InteractionEnsembleFilter, InteractionSurprise
 from torch_ebip.interaction.surprise import POINTS
-from torch_ebip.interaction.tail import Tail
 
 
 def strict(primitive: InteractionPrimitive, above: float = 0.0, **settings: float) -> InteractionSurprise:
@@ -18,8 +17,10 @@ def strict(primitive: InteractionPrimitive, above: float = 0.0, **settings: floa
     usual = 0.5 + torch.rand(POINTS, 2, S, generator=draws, dtype=torch.float64)
     largest = 0.3 * torch.rand(60, S, generator=draws, dtype=torch.float64) - 0.2 + above
     largest[:, -1] = torch.nan  # what the robot controls is not shown
-    surprise.know(usual.to(like), largest.to(like))
-    surprise.tail = Tail.fit((torch.rand(60, 1, generator=draws, dtype=torch.float64) - 0.5).to(like))
+    whole = torch.rand(60, 1, generator=draws, dtype=torch.float64) - 0.5
+    usual_bias = 0.05 + 0.1 * torch.rand(POINTS, S, generator=draws, dtype=torch.float64)
+    surprise.know(usual.to(like), usual_bias.to(like), largest.unsqueeze(-1).expand(-1, -1, 2).to(like))
+    surprise.know_whole(whole.expand(-1, 2).to(like))
     return surprise
 
 
@@ -30,7 +31,11 @@ def cautious(primitive: InteractionPrimitive, above: float = 0.0, **options: obj
     like = primitive.weights
     levels = (0.8, 1.0, 2.0)
     filter.doubt = Doubt(
-        like.new_tensor([1.0, 0.8, 0.4]), like.new_tensor([0.0, 0.5, 2.0]), primitive.value_variance, levels
+        like.new_tensor([1.0, 0.8, 0.4]),
+        like.new_tensor([0.0, 0.5, 2.0]),
+        primitive.value_variance,
+        levels,
+        like.new_tensor([0.0, 0.3, 0.6]),
     )
     filter.bounds = Bounds.of(primitive)
     return filter

@@ -99,7 +99,11 @@ def test_the_range_is_that_of_the_demonstrations() -> None:
 def test_doubt_is_the_formula() -> None:
     """Between its levels, and at the last of them with nobody knowing the moment; the end is the end."""
     doubt = Doubt(
-        torch.tensor([1.0, 0.6, 0.2]), torch.tensor([0.0, 1.0, 3.0]), torch.tensor([2.0, 7.0]), (1.0, 2.0, 4.0)
+        torch.tensor([1.0, 0.6, 0.2]),
+        torch.tensor([0.0, 1.0, 3.0]),
+        torch.tensor([2.0, 7.0]),
+        (1.0, 2.0, 4.0),
+        torch.tensor([0.0, 4.0, 6.0]),
     )
     f, v = torch.tensor([[3.0, -1.0], [5.0, 2.0]]), torch.tensor([[0.5, 0.1], [0.2, 0.3]])
     m, w = torch.tensor([[1.0, 1.0], [2.0, 2.0]]), torch.tensor([[0.4, 0.4], [0.1, 0.1]])
@@ -107,12 +111,16 @@ def test_doubt_is_the_formula() -> None:
     lead = Lead(torch.rand(2), torch.rand(2), torch.rand(2), end)
     said = Forecast(f, v, torch.rand(2))
     assert doubt(said, lead, m, w, torch.tensor(0.9)) is said
-    for level, share, widening, lost in ((1.5, 0.8, 0.5, 0.0), (3.0, 0.4, 2.0, 0.5), (9.0, 0.2, 3.0, 1.0)):
+    for level, share, widening, inflation, lost in (
+        (1.5, 0.8, 0.5, 2.0, 0.0),
+        (3.0, 0.4, 2.0, 5.0, 0.5),
+        (9.0, 0.2, 3.0, 6.0, 1.0),
+    ):
         ours = doubt(said, lead, m, w, torch.tensor(level))
         anywhere = np.array([2.0, 7.0])
         unit = np.maximum(w.numpy() + ELSEWHERE * anywhere, lost * (1 - end.numpy())[:, None] * anywhere)
         np.testing.assert_allclose(ours.mean, m + share * (f - m), rtol=1e-5)
-        np.testing.assert_allclose(ours.variance, share**2 * v.numpy() + widening * unit, rtol=1e-5)
+        np.testing.assert_allclose(ours.variance, share**2 * (1 + inflation) * v.numpy() + widening * unit, rtol=1e-5)
 
 
 def test_who_is_not_surprised_says_what_it_said() -> None:

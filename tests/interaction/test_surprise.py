@@ -17,7 +17,18 @@ from torch_ebip import BSplineBasis, EnsembleFilter, LiveFilter, StudentT, ebip
 from torch_ebip.common.draws import seeded
 from torch_ebip.filtering.updates.surprise import Noticed, believed
 from torch_ebip.interaction.surprise import InteractionSurprise
-from torch_ebip.interaction.surprise_memory import ABSURD, ALONE, HERE, LEAST_SAY, MOST, SurpriseMemory, state_of
+from torch_ebip.interaction.surprise_memory import (
+    ABSURD,
+    ALONE,
+    BEFORE,
+    HERE,
+    LEAST_SAY,
+    MOST,
+    MOST_BIAS,
+    ONE_SIDED,
+    SurpriseMemory,
+    state_of,
+)
 
 
 class TestCautious(FilterContract):
@@ -31,22 +42,26 @@ class TestCautious(FilterContract):
 
 
 class Oracle:
-    """The class's docstring in float64 numpy, one sample after the other."""
+    """The docstrings of both classes in float64 numpy, one sample after the other."""
 
     def __init__(self, surprise: InteractionSurprise) -> None:
-        names = ("mean", "variance", "noise", "usual", "bounds")
-        self.mean, self.variance, self.noise, self.usual, self.bounds = (
+        names = ("mean", "variance", "noise", "usual", "usual_bias", "bias_scale", "bounds")
+        self.mean, self.variance, self.noise, self.usual, self.usual_bias, self.scale, self.bounds = (
             getattr(surprise, name).double().numpy() for name in names
         )
         self.surprise, self.sensor = surprise, surprise.sensor_of_dof.numpy()
         S = self.usual.shape[-1]
-        self.total, self.samples, self.level, self.last = np.zeros((4, S))
+        self.total, self.samples, self.level, self.last, self.lately = np.zeros((5, S))
+        self.sums = np.zeros(len(self.sensor))
         self.largest, self.recent = -math.inf, 0.0
+        self.by_bias = self.by_pace = 0
         self.body = float(surprise.tail.quantiles[0, -1])
 
     def forget(self, dt: float) -> None:
         keep = math.exp(-dt / self.surprise.window)
         self.total, self.samples = self.total * keep, self.samples * keep
+        slowly = math.exp(-dt / self.surprise.bias_window)
+        self.lately, self.sums = self.lately * slowly, self.sums * slowly
         self.recent *= math.exp(-dt / self.surprise.memory)
 
     def at(self, table: np.ndarray, phase: float) -> np.ndarray:
@@ -54,7 +69,7 @@ class Oracle:
         flat = table.reshape(len(table), -1)
         return np.stack([np.interp(phase, grid, column) for column in flat.T]).reshape(table.shape[1:])
 
-    def judge(self, y, expected, variance, phase: float) -> np.ndarray:
+    def judge(self, y, expected, variance, phase: float, pace: float) -> np.ndarray:
         """What each sensor counts."""
         near = (y - expected) ** 2 / (variance + self.noise)
         far = (y - self.at(self.mean, phase)) ** 2 / (self.at(self.variance, phase) + self.noise)
@@ -67,7 +82,20 @@ class Oracle:
                 self.last[s] = math.log(u)
                 self.total[s] += min(u, MOST * math.exp(self.bounds[1, s]))
                 self.samples[s] += 1
-                self.level[s] = math.log((self.total[s] + 1) / (self.samples[s] + 1))
+                off = (y - expected) / np.sqrt((variance + self.noise) * usual[0, s])
+                self.sums[ours] += off.clip(-ONE_SIDED, ONE_SIDED)[ours]
+                self.lately[s] += 1
+                theirs = self.sensor == s
+                bias = np.mean((self.sums[theirs] / (self.lately[s] + BEFORE)) ** 2)
+                bias = self.scale[0, s] + self.scale[1, s] * math.log(
+                    max(bias / self.at(self.usual_bias, phase)[s], LEAST_SAY)
+                )
+                most = self.bounds[1, s] + math.log(MOST_BIAS)
+                if bias > most:
+                    self.sums[theirs] *= math.exp(-0.5 * (bias - most) / self.scale[1, s])
+                    bias = most
+                self.level[s] = max(math.log((self.total[s] + 1) / (self.samples[s] + 1)), bias)
+                self.by_bias += bias == self.level[s]
         known = self.surprise.known.numpy()
         voices = [s for s in range(S) if self.samples[s] > HERE and known[s]]
         excess = (self.level - self.bounds[0]) / (self.bounds[1] - self.bounds[0])
@@ -80,11 +108,15 @@ class Oracle:
         if voices and not np.isnan(y).all():
             say = counts[voices] + LEAST_SAY
             whole = float((excess[voices] * say).sum() / say.sum())
+            away = (pace - self.surprise.pace[0].item()) / self.surprise.pace[1].item()
+            offset, scale = self.surprise.pace_scale.tolist()
+            self.by_pace += offset + scale * math.log1p(away**2) > whole
+            whole = max(whole, offset + scale * math.log1p(away**2))
             self.largest, self.recent = max(self.largest, whole), max(self.recent, whole - self.body)
         return counts
 
 
-def conversation(count: int = 14, gaps: bool = True, seed: int = 3):
+def conversation(count: int = 18, gaps: bool = True, seed: int = 3):
     """Samples y, expected, variance [T, D] and phase [T] that surprise now and then."""
     draws = np.random.default_rng(seed)
     primitive = small_primitive(torch.float64)
@@ -97,6 +129,7 @@ def conversation(count: int = 14, gaps: bool = True, seed: int = 3):
     if gaps:
         y[2, 0], y[5, 2], y[6, :2], y[8] = (math.nan,) * 4
     y[:, 3:] = math.nan
+    path[4:, :3] -= np.array([0.15, 0.15, 0.1])  # from here on they differ in one direction
     return y, path + 0.05 * draws.standard_normal((count, 5)), draws.uniform(0.001, 0.05, (count, 5)), phase
 
 
@@ -104,17 +137,21 @@ def conversation(count: int = 14, gaps: bool = True, seed: int = 3):
 def test_it_is_the_formula(form: str) -> None:
     """Levels, what sensors count and the whole: of a sequence, of a batch of them, and of the fast twin."""
     surprise = strict(small_primitive(torch.float64))
+    surprise.usual_bias *= 0.3
     oracle = Oracle(surprise)
     y, expected, variance, phase = (torch.tensor(part) for part in conversation(gaps=form != "plain numbers"))
     memory = surprise.start(torch.zeros(*((2,) if form == "a batch" else ()), 3, 2, dtype=torch.float64))
     hand = torch.tensor([0, 1, 2])
     less = 0
+    paces = surprise.pace[0] + surprise.pace[1] * torch.linspace(0, 20, len(y), dtype=torch.float64)
     for t in range(len(y)):
         if t:
             oracle.forget(0.05)
             memory = surprise.forget(memory, torch.tensor(0.05, dtype=torch.float64))
-        wanted = oracle.judge(y[t].numpy(), expected[t].numpy(), variance[t].numpy(), float(phase[t]))
-        moving = torch.stack([phase[t], phase[t]])
+        wanted = oracle.judge(
+            y[t].numpy(), expected[t].numpy(), variance[t].numpy(), float(phase[t]), float(paces[t])
+        )
+        moving = torch.stack([phase[t], paces[t]])
         if form == "plain numbers":
             with torch.no_grad():
                 noticed = Noticed(y[t, hand], None, hand, expected[t, hand], variance[t, hand], moving)
@@ -136,6 +173,8 @@ def test_it_is_the_formula(form: str) -> None:
             each = counts[0] if form == "a batch" else counts
             np.testing.assert_allclose(each[:3], wanted[surprise.sensor_of_dof[:3].numpy()], atol=1e-12)
     assert less > 3
+    assert oracle.by_bias > 5
+    assert 2 < oracle.by_pace < len(y)
     assert (surprise._single is not None) == (form == "plain numbers")
 
 
@@ -144,7 +183,7 @@ def test_familiarity_is_the_chance_of_the_largest_so_far() -> None:
     memory = surprise.start(torch.zeros(2, 2))
     assert float(surprise.familiarity(memory)) == 1.0
     largest = torch.tensor([-0.49, 0.0, 0.3, 1.0])
-    said = surprise.familiarity(SurpriseMemory(torch.zeros(4, 3, 5), torch.stack([largest] * 3, -1)))
+    said = surprise.familiarity(SurpriseMemory(torch.zeros(4, 3, 8), torch.stack([largest] * 2, -1)))
     assert (said.diff() < 0).all()
     tail = surprise.tail
     assert abs(float(said[1]) - 0.5) < 0.1
@@ -313,6 +352,7 @@ def test_copies_have_tables_of_their_own() -> None:
         ({"suspect": 0.01, "rejected": 0.02}, "rejected less than suspect"),
         ({"window": 0.0}, "window"),
         ({"memory": -1.0}, "memory"),
+        ({"bias_window": 0.0}, "bias_window"),
     ],
 )
 def test_bad_settings_are_named(settings: dict[str, float], message: str) -> None:
@@ -327,4 +367,4 @@ def test_one_of_other_dofs_is_refused() -> None:
     with pytest.raises(ValueError, match="the surprise is for 3 DoFs, the model has 5"):
         part.check(model)
     with pytest.raises(ValueError, match=r"mean and variance must be \[P, 2\]"):
-        InteractionSurprise(torch.zeros(4, 3), torch.zeros(4, 3), torch.ones(2), torch.zeros(2, dtype=torch.long))
+        InteractionSurprise(*torch.zeros(2, 4, 3), torch.ones(2), torch.zeros(2, dtype=torch.long), torch.ones(2))

@@ -101,6 +101,7 @@ def test_what_is_learned_is_said(taught) -> None:
     assert doubt["share"] == sorted(doubt["share"], reverse=True)
     assert doubt["widening"] == sorted(doubt["widening"])
     assert doubt["widening"][-1] >= 1.0
+    assert doubt["inflation"] == sorted(doubt["inflation"])
     assert filter.surprise.known.tolist() == [True, True, False]
     values = filter.surprise.named_values(interactions(2).layout)
     assert set(values) == {"surprise/suspect/hand", "surprise/suspect/gaze"}

@@ -18,14 +18,14 @@ from torch_ebip.filtering.protocols import View
 from torch_ebip.interaction.forecast import Forecast
 from torch_ebip.interaction.readout import Lead, hats, moved, widths_of
 
-LEVELS = (1.3, 2.0, 3.0, 4.5, 6.0)
-"""Of doubt, -log10 of the chance of such a surprise: below the first of them, one in twenty, there is none."""
+LEVELS = (1.7, 2.3, 3.0, 4.5, 6.0)
+"""Of doubt, -log10 of the chance of such a surprise: below the first of them, one in fifty, there is none."""
 ELSEWHERE = 0.05
 """Share of the variance over all phases."""
 
 
 class Doubt(nn.Module):
-    """Mean m + s (f - m), variance s^2 sigma_f^2 + a u^2; s and a by how surprising the interaction is.
+    """Mean m + s (f - m), variance s^2 (1 + c) sigma_f^2 + a u^2; s, c and a by how surprising the interaction is.
 
     m are the demonstrations, f and sigma_f the forecast; u^2 is the variance of the demonstrations there and
     `ELSEWHERE` of that over all phases: nobody knows the phase well. From the last level on it may be any moment of
@@ -36,9 +36,10 @@ class Doubt(nn.Module):
         widening: [K], a, from 0 on not decreasing; the first is 0.
         anywhere: [D], variance of each DoF over all phases of all demonstrations, squared units.
         levels: [K], increasing.
+        inflation: [K], c, from 0 on not decreasing; the first is 0; default: 0.
 
     Raises:
-        ValueError: shapes that do not fit, shares outside [0, 1], a widening below 0.
+        ValueError: shapes that do not fit, shares outside [0, 1], a widening or an inflation below 0.
 
     Example:
         >>> import torch
@@ -54,20 +55,33 @@ class Doubt(nn.Module):
 
     share: Tensor
     widening: Tensor
+    inflation: Tensor
     levels: Tensor
     anywhere: Tensor
 
-    def __init__(self, share: Tensor, widening: Tensor, anywhere: Tensor, levels: Sequence[float] = LEVELS) -> None:
+    def __init__(
+        self,
+        share: Tensor,
+        widening: Tensor,
+        anywhere: Tensor,
+        levels: Sequence[float] = LEVELS,
+        inflation: Tensor | None = None,
+    ) -> None:
         super().__init__()
+        inflation = torch.zeros_like(share) if inflation is None else inflation
         places = as_values("levels", list(levels), None, share)
-        if share.shape != places.shape or widening.shape != places.shape or not bool((places.diff() > 0).all()):
-            raise ValueError(f"levels must increase, one for each share and widening, got {list(levels)}")
-        if not bool(((share >= 0) & (share <= 1)).all()) or not bool(
-            (widening >= 0).all() & widening.isfinite().all()
-        ):
-            raise ValueError("shares must lie between 0 and 1, and widenings be finite and not negative")
+        sizes = {tuple(values.shape) for values in (share, widening, inflation, places)}
+        if len(sizes) > 1 or not bool((places.diff() > 0).all()):
+            raise ValueError(
+                f"levels must increase, one for each share, widening and inflation, got {list(levels)} for "
+                f"{list(share.shape)}, {list(widening.shape)} and {list(inflation.shape)}"
+            )
+        wider = torch.cat([widening, inflation])
+        if not bool(((share >= 0) & (share <= 1)).all()) or not bool((wider >= 0).all() & wider.isfinite().all()):
+            raise ValueError("shares must lie between 0 and 1, widenings and inflations be finite and not negative")
         self.register_buffer("share", owned(share))
         self.register_buffer("widening", owned(widening))
+        self.register_buffer("inflation", owned(inflation))
         self.register_buffer("levels", owned(places))
         self.register_buffer("anywhere", owned(anywhere))
 
@@ -85,11 +99,11 @@ class Doubt(nn.Module):
         if not bool((doubt > levels[0]).any()):
             return forecast
         at = hats(doubt.clamp(levels[0], levels[-1]), levels)
-        share, widening = (at @ values for values in (self.share, self.widening))
-        share, widening = share[..., None, None], widening[..., None, None]
+        values = torch.stack([self.share, self.widening, self.inflation], -1)
+        share, widening, inflation = (at @ values)[..., None, None, :].unbind(-1)
         lost = (at[..., -1:] * (1 - lead.end)).unsqueeze(-1)
         widths = widths_of(forecast, variance)
-        spread = share.square() * forecast.variance + widening * torch.maximum(
+        spread = share.square() * (1 + inflation) * forecast.variance + widening * torch.maximum(
             self.unit(variance), lost * self.anywhere
         )
         doubted = (doubt > levels[0])[..., None, None]
@@ -114,5 +128,7 @@ class Doubt(nn.Module):
 
     def extra_repr(self) -> str:
         """Shares and widenings."""
-        pairs = zip(self.levels.tolist(), self.share.tolist(), self.widening.tolist(), strict=True)
-        return "; ".join(f"from {level:g}: share {s:.2f}, widening {a:.2f}" for level, s, a in pairs)
+        rows = zip(*(v.tolist() for v in (self.levels, self.share, self.inflation, self.widening)), strict=True)
+        return "; ".join(
+            f"from {level:g}: share {s:.2f}, inflation {c:.2f}, widening {a:.2f}" for level, s, c, a in rows
+        )

@@ -10,6 +10,8 @@ from torch_ebip.common.brief import brief
 
 MOST = 5.0
 """What a sample adds to the mean at most, as a multiple of what rejects: a sensor that agrees again is soon back."""
+MOST_BIAS = 2.0
+"""What a bias is at most, likewise: it is forgotten more slowly."""
 ABSURD = 1e9
 """The largest multiple there is."""
 HERE = 0.1
@@ -18,6 +20,12 @@ ALONE = (10.0, 100.0)
 """Multiples of what rejects a sensor among others between which a sample is rejected whatever the others say: all may
 be surprised because the interaction is another, but not by as much as that."""
 LEAST_SAY = 1e-3
+BEFORE = 3.0
+"""Samples without a bias that a mean begins with: the first few tell little of a direction."""
+ONE_SIDED = 3.0
+"""What a difference with a direction is at most, as a multiple of what is usual: many small ones tell, not one."""
+PER_SENSOR = 6
+"""Numbers that are kept of a sensor, beside the sums of its DoFs."""
 STATES = ("ok", "suspect", "rejected")
 
 
@@ -25,10 +33,11 @@ class SurpriseMemory(NamedTuple):
     """What is remembered of S sensors, and of all of them together.
 
     Attributes:
-        sensors: [..., S, 5], sums of multiples of what is usual and of samples, both discounted; the logarithm of
-            the mean multiple, 0 where it is as usual; what the sensor counts, 0 to 1; the last one's logarithm.
-        together: [..., 3], how surprising they were together last (0 suspect, 1 rejected); the most so far; and by
-            how much that was beyond the body of its distribution, forgotten slowly.
+        sensors: [..., S, 6 + m], sums of multiples of what is usual and of samples, both discounted; how surprising
+            it is, a logarithm, 0 where it is as usual; what it counts, 0 to 1; the last multiple's logarithm; and
+            discounted more slowly, the sum of samples and those of differences of its DoFs, m at most.
+        together: [..., 2], how surprising they were together at most so far (0 suspect, 1 rejected); and by how much
+            that was beyond the body of its distribution, forgotten slowly.
     """
 
     sensors: Tensor
@@ -50,12 +59,12 @@ class SurpriseMemory(NamedTuple):
     @property
     def largest(self) -> Tensor:
         """[...]; minus infinity before anything was seen."""
-        return self.together[..., 1]
+        return self.together[..., 0]
 
     @property
     def recent(self) -> Tensor:
         """[...], at least 0."""
-        return self.together[..., 2]
+        return self.together[..., 1]
 
 
 def state_of(counts: float) -> str:

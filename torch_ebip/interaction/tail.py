@@ -93,6 +93,22 @@ class Tail(nn.Module):
         return f"{len(self.length)} kinds"
 
 
+def on_one_scale(values: Tensor) -> tuple[Tensor, Tensor]:
+    """What brings the tail of a second kind of values to where that of the first begins, and to its length.
+
+    Args:
+        values: [B, 2], at least `FEWEST` of them, finite.
+
+    Returns:
+        Offset and scale, [2], of the second; and the larger of both then, [B].
+    """
+    tail = Tail.fit(values)
+    (begin, other), (length, others) = tail.quantiles[:, -1], tail.length
+    scale = length / others
+    offset = begin - scale * other
+    return torch.stack([offset, scale]), torch.maximum(values[:, 0], offset + scale * values[:, 1])
+
+
 def as_chances(suspect: float, rejected: float) -> dict[str, float]:
     """Both chances, checked.
 

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from torch_ebip.common.ambient import without_autocast
 from torch_ebip.common.brief import brief
+from torch_ebip.filtering.functional.scores import gaussian_crps
 from torch_ebip.interaction.doubt import ELSEWHERE, LEVELS, Doubt
 from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.primitive import InteractionPrimitive
@@ -30,6 +31,8 @@ from torch_ebip.recordings.demonstrations import Demonstrations
 
 SPEEDS = (0.4, 2.0)
 """At which demonstrations are played, as multiples of their own."""
+INFLATIONS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+"""That are tried."""
 FEWEST = 30
 """Interactions at a level of doubt that decide about it, at least."""
 
@@ -128,21 +131,23 @@ def learn_doubt(
     scale = held_out.task.objective.scale
     elsewhere = ELSEWHERE * anywhere[targets] / scale.square()
     levels = scale.new_tensor(LEVELS)
-    share, widening = torch.ones_like(levels), torch.zeros_like(levels)
+    share, inflation, widening = torch.ones_like(levels), torch.zeros_like(levels), torch.zeros_like(levels)
     counts = []
     for k in range(1, len(levels)):
-        share[k], widening[k] = share[k - 1], widening[k - 1]
+        share[k], inflation[k], widening[k] = share[k - 1], inflation[k - 1], widening[k - 1]
         here = [_at_level(said, levels, k, elsewhere) for said in kinds]
         counts.append([len(part.wanted) for part in here])
-        here = [part for part in here if len(part.wanted) >= FEWEST]
-        if here:
-            share[k] = min(_share(here), float(share[k - 1]))
-            widening[k] = max(_widening(here, share[k]), float(widening[k - 1]))
+        enough = [part for part in here if len(part.wanted) >= FEWEST]
+        if not enough and sum(counts[-1]) >= FEWEST:  # all as if they were of one kind
+            enough = [_Part(*(torch.cat(values) for values in zip(*here, strict=True)))]
+        if enough:
+            share[k] = min(_share(enough), float(share[k - 1]))
+            inflation[k], widening[k] = _widths(enough, share[k], inflation[k - 1], widening[k - 1])
     widening[-1] = max(float(widening[-1]), 1.0)
-    return Doubt(share, widening, anywhere), {
+    said = {"share": share, "inflation": inflation, "widening": widening}
+    return Doubt(share, widening, anywhere, inflation=inflation), {
         "levels": list(LEVELS),
-        "share": [round(s, 3) for s in share.tolist()],
-        "widening": [round(a, 3) for a in widening.tolist()],
+        **{name: [round(value, 3) for value in values.tolist()] for name, values in said.items()},
         "moments": counts,
     }
 
@@ -178,6 +183,23 @@ def _share(kinds: list[_Part]) -> float:
         error = miss.square().nanmean((1, 2, 3))
         regrets.append(error / error.min().clamp(min=1e-12))
     return float(grid[torch.stack(regrets).amax(0).argmin()])
+
+
+def _widths(kinds: list[_Part], share: Tensor, inflation: Tensor, widening: Tensor) -> tuple[float, float]:
+    """c and a of `Doubt`, not below those of a lower level: of pairs that cover the truth that with the least CRPS.
+
+    What is sure of itself and a little wrong needs c, what is lost needs a.
+    """
+    best = (math.inf, 0.0, 0.0)
+    for c in (c for c in INFLATIONS if c >= float(inflation)):
+        wider = [part._replace(own=part.own * math.sqrt(1 + c)) for part in kinds]
+        a = max(_widening(wider, share), float(widening))
+        scores = []
+        for part in wider:
+            variance = (share * part.own).square() + a * part.unit
+            scores.append(gaussian_crps(share * part.towards, variance, part.wanted).nanmean())
+        best = min(best, (float(torch.stack(scores).mean()), c, a))
+    return best[1:]
 
 
 def _widening(kinds: list[_Part], share: Tensor) -> float:

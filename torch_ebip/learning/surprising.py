@@ -1,13 +1,14 @@
 """How surprised a filter is by interactions that it should know: from which level on that says something.
 
 Interactions are filtered by ensembles of others, whole and at their full rate, as a session would; nobody is judged
-then. What was noticed is kept, and judged afterwards: first what is usual at a phase, then how large a level becomes
-in a whole interaction, sensor by sensor, then the same of all together.
+then. What was noticed is kept, and judged afterwards: first what is usual at a phase, then how large levels become in
+a whole interaction, sensor by sensor, then the same of all together.
 """
 
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -22,7 +23,7 @@ from torch_ebip.interaction.filter_kinds import InteractionEnsembleFilter
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.interaction.surprise import POINTS, InteractionSurprise
 from torch_ebip.interaction.surprise_memory import SurpriseMemory
-from torch_ebip.interaction.tail import FEWEST, Tail
+from torch_ebip.interaction.tail import FEWEST
 from torch_ebip.learning.held_out import HeldOut
 from torch_ebip.learning.ranks import Ranks
 
@@ -30,6 +31,8 @@ MOST = 200
 """Interactions that decide, at most."""
 SMOOTH = 0.05
 """Phase over which what is usual is smoothed, a standard deviation."""
+FINEST = 4
+"""Times as many interactions as there are would show the smallest chance that is looked for."""
 LEAST_USUAL = 0.05
 """Of a square, as a share of its mean over all phases."""
 
@@ -95,11 +98,13 @@ def learn_surprise(
     # Several sets of sensors say several times something of the same interaction.
     some = interactions[: max(FEWEST, MOST // len(held_out.task.subsets))]
     conversations = listen(held_out, filter, some, primitive)
-    usual = _usual(surprise, conversations, held_out.ranks)
-    surprise.usual.copy_(usual)
-    largest, _ = _largest(surprise, conversations, held_out.ranks)
-    surprise.know(usual, largest)
-    surprise.tail = Tail.fit(_largest(surprise, conversations, held_out.ranks)[1].unsqueeze(-1))
+    surprise.usual.copy_(_usual(surprise, conversations, held_out.ranks))
+    usual_bias = _usual_bias(surprise, conversations, held_out.ranks)
+    surprise.usual_bias.copy_(usual_bias)
+    largest = _largest(surprise, conversations, held_out.ranks)[0]
+    surprise.know(surprise.usual.clone(), usual_bias, largest, 1 / (FINEST * len(some)))
+    surprise.know_whole(_largest(surprise, conversations, held_out.ranks)[1])
+    assert surprise.tail is not None
     names = [name for name, known in zip(primitive.layout.names, surprise.known.tolist(), strict=True) if known]
     return surprise, {
         "interactions": len(some),
@@ -136,34 +141,66 @@ def _usual(surprise: InteractionSurprise, conversations: list[Conversation], ran
     sums = surprise.usual.new_zeros(2, *surprise.usual.shape).double()
     for heard, _ in conversations:
         for by, noticed, _ in heard:
-            if noticed is None:
-                continue
-            squares, here = by.squares(noticed)
-            place = (noticed.mean[..., 0].clamp(0, 1) * (POINTS - 1)).round().long()
-            weight = here.unsqueeze(-2).expand_as(squares).double()
-            sums[0].index_add_(0, place, squares.double() * weight)
-            sums[1].index_add_(0, place, weight)
+            if noticed is not None:
+                squares, here, _ = by.squares(noticed)
+                _add(sums, noticed, squares, here.unsqueeze(-2))
+    return _smoothed(sums, ranks).to(surprise.usual)
+
+
+def _usual_bias(surprise: InteractionSurprise, conversations: list[Conversation], ranks: Ranks) -> Tensor:
+    """[P, S], the mean square of the bias at the phases of the grid, smoothed."""
+    sums = surprise.usual.new_zeros(2, *surprise.usual_bias.shape).double()
+    for heard, count in conversations:
+        for noticed, _, here, both in _told(surprise, heard, count):
+            _add(sums, noticed, both[..., 1].exp(), here)
+    return _smoothed(sums, ranks).to(surprise.usual)
+
+
+def _add(sums: Tensor, noticed: Noticed, values: Tensor, here: Tensor) -> None:
+    """To sums and counts [2, P, ...] of what was noticed, values [B, ...] where they are here, 1 or 0."""
+    place = (noticed.mean[..., 0].clamp(0, 1) * (POINTS - 1)).round().long()
+    weight = here.expand_as(values).double()
+    sums[0].index_add_(0, place, values.double() * weight)
+    sums[1].index_add_(0, place, weight)
+
+
+def _smoothed(sums: Tensor, ranks: Ranks) -> Tensor:
+    """[P, ...], means over phases near by, of sums and counts [2, P, ...] over all processes."""
     ranks.add_up([sums])
     grid = torch.linspace(0, 1, POINTS, dtype=sums.dtype, device=sums.device)
     near = torch.exp(-0.5 * ((grid - grid[:, None]) / SMOOTH).square())
-    total, counts = torch.einsum("pq,nqks->npks", near, sums)
+    total, counts = torch.einsum("pq,nq...->np...", near, sums)
     overall = sums[0].sum(0) / sums[1].sum(0).clamp(min=1)
     overall = torch.where(overall > 0, overall, 1)
-    return torch.maximum(total / counts.clamp(min=1e-9), LEAST_USUAL * overall).to(surprise.usual)
+    return torch.maximum(total / counts.clamp(min=1e-9), LEAST_USUAL * overall)
 
 
 def _largest(surprise: InteractionSurprise, conversations: list[Conversation], ranks: Ranks) -> tuple[Tensor, Tensor]:
-    """The largest level of each sensor [B, S], NaN where it was not shown, and the largest of the whole [B]."""
+    """The largest logarithms of each sensor [B, S, 2], NaN where it was not shown, and of the whole [B, 2]."""
     found = [_largest_of(surprise, heard, count) for heard, count in conversations]
     everyone = [pair for rank in ranks.gather([[part.cpu() for part in pair] for pair in found]) for pair in rank]
-    levels, whole = (torch.cat(parts).to(surprise.usual) for parts in zip(*everyone, strict=True))
-    return levels, whole
+    logarithms, whole = (torch.cat(parts).to(surprise.usual) for parts in zip(*everyone, strict=True))
+    return logarithms, whole
 
 
 def _largest_of(surprise: InteractionSurprise, heard: list[Heard], count: int) -> tuple[Tensor, Tensor]:
     """The same of one conversation about so many interactions."""
+    lowest = surprise.noise.new_full((count,), -torch.inf)
+    largest, whole = lowest[:, None, None].expand(-1, surprise.n_sensors, 2), lowest[:, None].expand(-1, 2)
+    for noticed, memory, here, both in _told(surprise, heard, count):
+        seen = here > 0
+        largest = torch.where(seen.unsqueeze(-1), torch.maximum(largest, both), largest)
+        now, _ = surprise.verdict(memory, noticed)
+        whole = torch.where(seen.any(-1, keepdim=True), torch.maximum(whole, now), whole)
+    return torch.where(largest.isinf(), torch.nan, largest), whole
+
+
+def _told(
+    surprise: InteractionSurprise, heard: list[Heard], count: int
+) -> Iterator[tuple[Noticed, SurpriseMemory, Tensor, Tensor]]:
+    """A conversation about so many interactions once more: each sample, the memory after it, which sensors it has,
+    1 or 0 [B, S], and the logarithms of levels, [B, S, 2], see `SensorLevels.update`."""
     memory = surprise.start(surprise.noise.new_zeros(count, 1, 1))
-    levels, whole = torch.full_like(memory.level, -torch.inf), memory.largest
     parts: dict[int, InteractionSurprise] = {}
     for by, noticed, dt in heard:
         if noticed is None:
@@ -172,11 +209,8 @@ def _largest_of(surprise: InteractionSurprise, heard: list[Heard], count: int) -
             continue
         if id(by) not in parts:  # what listened has the DoFs that were shown, but nothing learned
             parts[id(by)] = part = sharing(surprise)
-            for name in ("mean", "variance", "noise", "sensor_of_dof"):
+            for name in ("mean", "variance", "noise", "sensor_of_dof", "place_of_dof"):
                 part.register_buffer(name, getattr(by, name))
             part.stride = by.stride
-        memory, here = parts[id(by)].update(memory, noticed)
-        levels = torch.where(here, torch.maximum(levels, memory.level), levels)
-        now, _ = parts[id(by)].verdict(memory)
-        whole = torch.where(here.any(-1), torch.maximum(whole, now), whole)
-    return torch.where(levels.isinf(), torch.nan, levels), whole
+        memory, seen, both = parts[id(by)].update(memory, noticed)
+        yield noticed, memory, seen.to(both), both
