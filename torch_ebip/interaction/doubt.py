@@ -18,8 +18,8 @@ from torch_ebip.filtering.protocols import View
 from torch_ebip.interaction.forecast import Forecast
 from torch_ebip.interaction.readout import Lead, hats, moved, widths_of
 
-LEVELS = (1.7, 2.3, 3.0, 4.5, 6.0)
-"""Of doubt, -log10 of the chance of such a surprise: below the first of them, one in fifty, there is none."""
+LEVELS = (1.5, 2.1, 3.0, 4.5, 6.0)
+"""Of doubt, -log10 of the chance of such a surprise: below the first of them, one in thirty, there is none."""
 ELSEWHERE = 0.05
 """Share of the variance over all phases."""
 

@@ -67,7 +67,7 @@ class InteractionSurprise(SensorLevels):
         pace: Tensor,
         window: float = 0.15,
         bias_window: float = 0.5,
-        memory: float = 2.0,
+        memory: float = 1.0,
         suspect: float = 0.01,
         rejected: float = 0.001,
     ) -> None:
@@ -84,7 +84,7 @@ class InteractionSurprise(SensorLevels):
 
         Args:
             primitive: of the demonstrations.
-            settings: ``window``, ``bias_window``, ``memory`` (default: twice as long as a demonstration),
+            settings: ``window``, ``bias_window``, ``memory`` (default: half as long as a demonstration),
                 ``suspect``, ``rejected``.
         """
         weights, basis = primitive.weights, primitive.basis
@@ -95,7 +95,7 @@ class InteractionSurprise(SensorLevels):
         least = 1e-6 * primitive.value_variance + torch.finfo(weights.dtype).eps ** 1.5
         noise = torch.maximum(primitive.residual_variance, least)
         sensors = primitive.layout.modality_of_dof.to(weights.device)
-        settings = {"memory": 2 * float(1 / primitive.phase_velocity.median()), **settings}
+        settings = {"memory": 0.5 * float(1 / primitive.phase_velocity.median()), **settings}
         pace = primitive.phase_velocity.mean()
         deviation = primitive.phase_velocity.var(correction=0).sqrt().clamp(min=LEAST_SPREAD * pace)
         return cls(mean, variance.clamp(min=0), noise, sensors, torch.stack([pace, deviation]), **settings)

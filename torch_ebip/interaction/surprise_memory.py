@@ -22,7 +22,7 @@ be surprised because the interaction is another, but not by as much as that."""
 LEAST_SAY = 1e-3
 BEFORE = 3.0
 """Samples without a bias that a mean begins with: the first few tell little of a direction."""
-ONE_SIDED = 3.0
+ONE_SIDED = 6.0
 """What a difference with a direction is at most, as a multiple of what is usual: many small ones tell, not one."""
 PER_SENSOR = 6
 """Numbers that are kept of a sensor, beside the sums of its DoFs."""

@@ -19,7 +19,9 @@ FEWEST = 20
 class Tail(nn.Module):
     """Chances of a value above x: between quantiles as they were found, behind the last of them exponential.
 
-    Of logarithms an exponential tail is Pareto's, and its length, the mean excess, is Hill's estimate (1975).
+    Of logarithms an exponential tail is Pareto's, and its length is Hill's estimate (1975). The largest tenth of what
+    is behind the last quantile, one at least, is only known to be no smaller than the next one (Epstein and Sobel,
+    1953, of lives that are censored): a recording that is odd itself does not decide about all others.
 
     Args:
         quantiles: [G, Q], of G kinds at the probabilities `BODY`, not decreasing.
@@ -62,9 +64,9 @@ class Tail(nn.Module):
         if len(values) < FEWEST or not bool(values.isfinite().all()):
             raise ValueError(f"a tail is fitted to at least {FEWEST} finite values, got {list(values.shape)}")
         quantiles = values.double().quantile(values.new_tensor(BODY, dtype=torch.float64), 0).T
-        excess = (values.double().T - quantiles[:, -1:]).clamp(min=0)
-        behind = (excess > 0).sum(-1).clamp(min=1)
-        return cls(quantiles.to(values), (excess.sum(-1) / behind).clamp(min=1e-3).to(values))
+        excess = (values.double().T - quantiles[:, -1:]).sort(-1).values
+        length = torch.stack([_length(some[some > 0]) for some in excess])
+        return cls(quantiles.to(values), length.clamp(min=1e-3).to(values))
 
     def above(self, x: Tensor) -> Tensor:
         """Chances [..., G] of more than x [..., G]; 1 below what was ever found."""
@@ -91,6 +93,15 @@ class Tail(nn.Module):
     def extra_repr(self) -> str:
         """Sizes."""
         return f"{len(self.length)} kinds"
+
+
+def _length(excess: Tensor) -> Tensor:
+    """[], of an exponential distribution of which these, ascending, were drawn, the largest tenth censored."""
+    count = len(excess)
+    certain = count - math.ceil(count / 10)
+    if certain < 1:
+        return excess.sum() / max(count, 1)
+    return (excess[:certain].sum() + (count - certain) * excess[certain - 1]) / certain
 
 
 def on_one_scale(values: Tensor) -> tuple[Tensor, Tensor]:

@@ -34,7 +34,7 @@ SPEEDS = (0.4, 2.0)
 INFLATIONS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """That are tried."""
 FEWEST = 30
-"""Interactions at a level of doubt that decide about it, at least."""
+"""Moments of each kind that decide about a level of doubt, at least."""
 
 
 class Unlike(Partition):
@@ -134,15 +134,11 @@ def learn_doubt(
     share, inflation, widening = torch.ones_like(levels), torch.zeros_like(levels), torch.zeros_like(levels)
     counts = []
     for k in range(1, len(levels)):
-        share[k], inflation[k], widening[k] = share[k - 1], inflation[k - 1], widening[k - 1]
-        here = [_at_level(said, levels, k, elsewhere) for said in kinds]
-        counts.append([len(part.wanted) for part in here])
-        enough = [part for part in here if len(part.wanted) >= FEWEST]
-        if not enough and sum(counts[-1]) >= FEWEST:  # all as if they were of one kind
-            enough = [_Part(*(torch.cat(values) for values in zip(*here, strict=True)))]
-        if enough:
-            share[k] = min(_share(enough), float(share[k - 1]))
-            inflation[k], widening[k] = _widths(enough, share[k], inflation[k - 1], widening[k - 1])
+        near = [hats(said.doubt.clamp(levels[0], levels[-1]), levels)[..., k] >= 0.5 for said in kinds]
+        counts.append([int(some.sum()) for some in near])
+        here = [_part(said, some, elsewhere) for said, some in zip(kinds, near, strict=True)]
+        share[k] = min(_share(here), float(share[k - 1]))
+        inflation[k], widening[k] = _widths(here, share[k], inflation[k - 1], widening[k - 1])
     widening[-1] = max(float(widening[-1]), 1.0)
     said = {"share": share, "inflation": inflation, "widening": widening}
     return Doubt(share, widening, anywhere, inflation=inflation), {
@@ -164,9 +160,10 @@ class _Part(NamedTuple):
         return brief(self)
 
 
-def _at_level(said: Said, levels: Tensor, k: int, elsewhere: Tensor) -> _Part:
-    """What a kind of strangers says near a level."""
-    near = hats(said.doubt.clamp(levels[0], levels[-1]), levels)[..., k] >= 0.5
+def _part(said: Said, near: Tensor, elsewhere: Tensor) -> _Part:
+    """What a kind of strangers says at moments bool [R, K]; where they are too few, when it surprises most."""
+    if int(near.sum()) < FEWEST:
+        near = said.doubt >= said.doubt.flatten().topk(min(FEWEST, said.doubt.numel())).values[-1]
     unit = said.demonstrated.square() + elsewhere
     return _Part(said.towards[near], said.wanted[near], said.own[near], unit[near])
 
