@@ -4,14 +4,13 @@ Without --data: reaches, simulated; learned from those that are familiar, asked 
 of a sensor, and about strange ones: slower and faster than any, from elsewhere, by a detour, to another place. With
 --data the recordings are cut into two clusters by k-means: the larger one is learned, the other is strange.
 `ebip_cautious` is what `learn` gives; `ebip_sure` is the same filter without surprise, doubt and bounds; `mean` the
-training mean of the end.
+training mean of the end. Then sessions, sample by sample, of what was learned and of a filter that was made by hand.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,14 +26,18 @@ from experiments.results import Values, summarise
 from experiments.run_folder import RunFolder, save_figure
 from experiments.surprise.figure import surprise_figure
 from experiments.surprise.lies import TRUTHLESS, lies
-from experiments.surprise.measure import ALARM, HALF, SHARES, Noticed, auc, measure, scores, unit_of
+from experiments.surprise.measure import ALARM, HALF, SHARES, Noticed, auc, measure, scores, undisturbed, unit_of
 from experiments.surprise.reaches import STRANGE, reaches
+from experiments.surprise.sessions import as_plain, heard, table_of
+from experiments.surprise.sure import sure
 from torch_ebip import Demonstrations, Forecast, InteractionModel, InteractionPrimitive, learn
 from torch_ebip.interaction import DemonstrationTable
 
 CONSOLE = Console(width=140)
 TRAINING = 120
 """Simulated interactions that are learned from."""
+SESSIONS = 12
+"""Of each kind of lies."""
 
 
 def sets_of(options: argparse.Namespace) -> tuple[Demonstrations, Demonstrations, dict[str, Demonstrations]]:
@@ -75,13 +78,6 @@ def clusters(demonstrations: Demonstrations, seed: int) -> tuple[Any, Any]:
     return np.flatnonzero(label == sizes.argmax()), np.flatnonzero(label != sizes.argmax())
 
 
-def sure(model: InteractionModel) -> InteractionModel:
-    """The same filter, which nothing surprises."""
-    bold = model.rebuilt()
-    bold.filter.doubt = bold.filter.bounds = bold.filter.analysis.surprise = None
-    return replace(bold)
-
-
 def mean_of(model: InteractionModel, count: int) -> Forecast:
     """What the demonstrations' mean and spread say of the end, [count, K, 1, D]."""
     mean, variance = model.filter.demonstrated(torch.ones(count, len(SHARES), 1))
@@ -118,6 +114,7 @@ def main(arguments: list[str] | None = None) -> None:
         for f in faults[1:]
     ]
     asked += [(name, them, them, True) for name, them in strange.items()]
+    lying = [fault.name for fault in faults if fault.group in ("offset", "unit", "axes", "frozen", "drift")]
     values: Values = {}
     noticed: dict[str, Noticed] = {}
     for name, truth, said, true in tqdm(asked, desc="sets", unit="set", dynamic_ncols=True):
@@ -131,6 +128,9 @@ def main(arguments: list[str] | None = None) -> None:
             end = torch.stack([trajectory[-1] for trajectory in truth])[:, known.layout.controlled]
             for cell, arrays in scores("mean", mean_of(model, len(end)), end, name, unit_of(known.layout)).items():
                 values[cell].update(arrays)
+    few = range(min(len(some), SESSIONS))
+    streams = {name: said.subset(few) for name, _, said, _ in asked if name in (*lying, *TRUTHLESS)}
+    sessions = heard(model, some.subset(few), streams, options.seed)
     usual = noticed["familiar"]
     names = [*known.layout.names, "the whole"]
     detection = {name: _detected(seen, usual, names) for name, seen in noticed.items()}
@@ -144,13 +144,17 @@ def main(arguments: list[str] | None = None) -> None:
         **summarise(values, "ebip_sure"),
         "detection": detection,
         "alarm": ALARM,
+        "undisturbed": undisturbed(values, "familiar"),
+        "sessions": as_plain(sessions),
         "seconds": round(time.monotonic() - began, 1),
     }
     save_figure(surprise_figure(results), run.path / "surprise.png")
     run.finish(results)
-    for metric in ("mae", "coverage_95", "beyond_4", "deviation"):
+    for metric in ("mae", "mse", "crps", "coverage_95", "beyond_4", "deviation"):
         _print_scores(results["rows"], metric, list(methods))
     _print_detection(detection, names)
+    _print_undisturbed(results["undisturbed"])
+    CONSOLE.print(table_of(sessions, unit_of(known.layout)))
     print(f"{results['seconds']:.0f} s; written to {run.path}")
 
 
@@ -196,6 +200,17 @@ def _print_detection(detection: dict[str, dict[str, Any]], names: list[str]) -> 
             for s in shown
         ]
         table.add_row(name, *cells, f"{found['auc_by_half']:.3f}")
+    CONSOLE.print(table)
+
+
+def _print_undisturbed(ratios: dict[str, dict[str, float]]) -> None:
+    """As a table: what caution costs where nothing is wrong."""
+    table = Table(title="familiar interactions: cautious as a multiple of sure", title_justify="left")
+    table.add_column("")
+    for share in ratios:
+        table.add_column(f"{float(share):.0%}", justify="right")
+    for name in next(iter(ratios.values())):
+        table.add_row(name, *(f"{found[name]:.3f}" for found in ratios.values()))
     CONSOLE.print(table)
 
 

@@ -97,6 +97,7 @@ def scores(name: str, forecast: Forecast, end: Tensor, subset: str, unit: str) -
     crps = forecast.crps(end[:, None, None, :].expand_as(forecast.mean))[:, :, 0]
     found = {
         ("mae", unit): miss,
+        ("mse", "1" if unit == "1" else f"({unit})^2"): miss.square(),
         ("crps", unit): crps,
         ("coverage_95", "1"): (miss <= Z95 * deviation).double(),
         ("beyond_4", "1"): (miss > 4 * deviation).double(),
@@ -107,6 +108,18 @@ def scores(name: str, forecast: Forecast, end: Tensor, subset: str, unit: str) -
         for (metric, its), value in found.items()
         for k, share in enumerate(SHARES)
     }
+
+
+def undisturbed(values: Values, subset: str) -> dict[str, dict[str, float]]:
+    """What caution costs on a set, after each share: cautious as a multiple of sure, CRPS and median deviation."""
+    found: dict[str, dict[str, float]] = {}
+    for cell, arrays in values.items():
+        if cell.subset == subset and cell.metric in ("crps", "deviation"):
+            its, others = arrays["ebip_cautious"], arrays["ebip_sure"]
+            middle = np.mean if cell.metric == "crps" else np.median
+            name = "CRPS" if cell.metric == "crps" else "median deviation"
+            found.setdefault(str(cell.observed), {})[name] = float(middle(its) / middle(others))
+    return found
 
 
 def unit_of(layout: Layout) -> str:

@@ -72,6 +72,14 @@ def test_the_command_finds_who_lies(tmp_path, capsys: pytest.CaptureFixture[str]
     assert {row["method"] for row in results["rows"]} == {"ebip_cautious", "ebip_sure", "mean"}
     assert not [row for row in results["rows"] if row["subset"] == "random walk"]
     assert all(math.isfinite(row["mean"]) for row in results["rows"])
+    assert set(results["undisturbed"]) == {"0.2", "0.43", "0.5", "0.82"}
+    sessions = results["sessions"]
+    assert all(0 <= row["outside"] <= 0.25 for rows in sessions.values() for row in rows.values())
+    learned = sessions["learned"]
+    assert sessions["ebip by hand"]["backwards"]["familiarity"] is None
+    assert learned["familiar"]["familiarity"] > 0.01 > learned["backwards"]["familiarity"]
+    assert learned["a second interaction"]["familiarity"] < 0.01
+    assert learned["hand off by 0.5"]["states"] == {"hand": "rejected", "elbow": "ok", "head": "ok"}
     assert (tmp_path / "run" / "surprise.png").stat().st_size > 10_000
     assert "AUC by half" in capsys.readouterr().out
     with pytest.raises(SystemExit, match="finished run"):

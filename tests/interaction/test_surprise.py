@@ -161,7 +161,7 @@ def test_it_is_the_formula(form: str) -> None:
             if form == "a batch":
                 parts = tuple(None if part is None else torch.stack([part, part]) for part in parts)
             memory, counts = surprise.judge(memory, Noticed(*parts))
-        one = SurpriseMemory(*(part[0] for part in memory)) if form == "a batch" else memory
+        one = SurpriseMemory(memory.kept[0]) if form == "a batch" else memory
         np.testing.assert_allclose(one.counts, wanted, atol=1e-12)
         np.testing.assert_allclose(one.level, oracle.level, atol=1e-12)
         np.testing.assert_allclose(
@@ -183,7 +183,7 @@ def test_familiarity_is_the_chance_of_the_largest_so_far() -> None:
     memory = surprise.start(torch.zeros(2, 2))
     assert float(surprise.familiarity(memory)) == 1.0
     largest = torch.tensor([-0.49, 0.0, 0.3, 1.0])
-    said = surprise.familiarity(SurpriseMemory(torch.zeros(4, 3, 8), torch.stack([largest] * 2, -1)))
+    said = surprise.familiarity(SurpriseMemory(largest[:, None, None].expand(-1, 4, 8)))
     assert (said.diff() < 0).all()
     tail = surprise.tail
     assert abs(float(said[1]) - 0.5) < 0.1
@@ -296,7 +296,7 @@ def test_a_snapshot_holds_it_and_a_copy_of_the_filter_works() -> None:
         live.update(row + 1.0)
         said.append([*live.carrier.memory.surprise, live.phase])
     assert all(torch.equal(a, b) for a, b in zip(*said, strict=True))
-    assert not torch.equal(said[0][0], kept.memory.surprise.sensors)
+    assert not torch.equal(said[0][0], kept.memory.surprise.kept)
 
 
 def test_who_is_not_known_has_no_say() -> None:
@@ -315,7 +315,7 @@ def test_who_is_not_known_has_no_say() -> None:
     for memory in (plain, tensors):
         assert float(surprise.familiarity(memory)) == 1.0
         assert (memory.counts == 1).all()
-    torch.testing.assert_close(plain.sensors, tensors.sensors)
+    torch.testing.assert_close(plain.kept, tensors.kept)
 
 
 def test_an_absurd_value_of_one_sensor_reaches_no_other() -> None:
@@ -326,7 +326,7 @@ def test_an_absurd_value_of_one_sensor_reaches_no_other() -> None:
     noticed = Noticed(y, seen, None, torch.zeros(5), torch.ones(5), torch.tensor([0.3, 1.0]))
     memory, counts = surprise.judge(surprise.start(torch.zeros(3, 2)), noticed)
     assert counts[:2].tolist() == [0.0, 0.0]
-    assert memory.sensors.isfinite().all()
+    assert memory.kept[..., :-1, :].isfinite().all()
 
 
 def test_copies_have_tables_of_their_own() -> None:

@@ -99,7 +99,7 @@ class SensorLevels(Surprise):
         self.register_buffer("known", torch.zeros(S, dtype=torch.bool, device=mean.device))
         self.register_buffer("bounds", torch.stack([mean.new_zeros(S), mean.new_ones(S)]))
         self.most_dofs = int(same.sum(1).max())
-        self._kept: tuple[Tensor, Tensor, Tensor] | None = None
+        self._kept: tuple[Tensor, Tensor] | None = None
 
     @property
     def n_sensors(self) -> int:
@@ -117,11 +117,10 @@ class SensorLevels(Surprise):
 
     def start(self, like: Tensor) -> SurpriseMemory:
         """See `Surprise.start`: members ``like`` [..., E, n]."""
-        sensors = self.noise.new_zeros(*like.shape[:-2], self.n_sensors, PER_SENSOR + self.most_dofs)
-        sensors[..., 3] = 1
-        together = self.noise.new_zeros(*like.shape[:-2], 2)
-        together[..., 0] = -math.inf
-        return SurpriseMemory(sensors, together)
+        kept = self.noise.new_zeros(*like.shape[:-2], self.n_sensors + 1, PER_SENSOR + self.most_dofs)
+        kept[..., :-1, 3] = 1
+        kept[..., -1, 0] = -math.inf
+        return SurpriseMemory(kept)
 
     def forget(self, memory: SurpriseMemory, dt: Tensor) -> SurpriseMemory:
         """See `Surprise.forget`, over dt [...] s."""
@@ -130,9 +129,9 @@ class SensorLevels(Surprise):
             one = torch.ones_like(dt)
             window, bias, slowly = (torch.exp(-dt / s) for s in (self.window, self.bias_window, self.memory))
             each = torch.stack([window, window, one, one, one, *[bias] * (1 + self.most_dofs)], -1)
-            self._kept = kept = dt, each.unsqueeze(-2), torch.stack([one, slowly], -1)
-        _, sensors, together = kept
-        return SurpriseMemory(memory.sensors * sensors, memory.together * together)
+            whole = torch.stack([one, slowly, *[one] * (PER_SENSOR - 2 + self.most_dofs)], -1)
+            self._kept = kept = dt, torch.stack([*[each] * self.n_sensors, whole], -2)
+        return SurpriseMemory(memory.kept * kept[1])
 
     def squares(self, noticed: Noticed) -> tuple[Tensor, Tensor, Tensor]:
         """What a sample says of each sensor.
@@ -204,8 +203,8 @@ class SensorLevels(Surprise):
             bias, sums = bias - less, sums * torch.exp(-0.5 * less).unsqueeze(-1)
         level = torch.where(seen, torch.maximum(recent, self.bias_scale[0] + self.bias_scale[1] * bias), level)
         kept = torch.stack([total, samples, level, counts.expand_as(level), last, lately], -1)
-        memory = memory._replace(sensors=torch.cat([kept, sums], -1))
-        return memory, seen, torch.stack([recent, bias], -1)
+        rows = torch.cat([torch.cat([kept, sums], -1), memory.kept[..., -1:, :].expand(*sums.shape[:-2], 1, -1)], -2)
+        return SurpriseMemory(rows), seen, torch.stack([recent, bias], -1)
 
     @property
     def dofs_of_sensor(self) -> Tensor:

@@ -159,8 +159,8 @@ class InteractionSurprise(SensorLevels):
             single = self._single
             if single is None or single.changed(self):
                 self._single = single = SingleJudge(self)
-            sensors, together, counts = single(memory, noticed)
-            memory = SurpriseMemory(sensors, together)
+            kept, counts = single(memory, noticed)
+            memory = SurpriseMemory(kept)
         else:
             memory, seen, _ = self.update(memory, noticed)
             if self.tail is None:
@@ -168,18 +168,12 @@ class InteractionSurprise(SensorLevels):
             both, counts = self.verdict(memory, noticed)
             whole = torch.maximum(both[..., 0], self.pace_scale[0] + self.pace_scale[1] * both[..., 1])
             beyond = (whole - self.tail.quantiles[0, -1]).clamp(min=0)
-            largest, recent = memory.together.unbind(-1)
             some = seen.any(-1) & self.voices(memory).any(-1)
-            together = torch.stack(
-                [
-                    torch.where(some, torch.maximum(largest, whole), largest),
-                    torch.where(some, torch.maximum(recent, beyond), recent),
-                ],
-                -1,
-            )
-            sensors = memory.sensors
-            sensors = torch.cat([sensors[..., :3], counts.unsqueeze(-1), sensors[..., 4:]], -1)
-            memory = SurpriseMemory(sensors, together)
+            kept = memory.kept.clone()
+            kept[..., :-1, 3] = counts
+            kept[..., -1, 0] = torch.where(some, torch.maximum(memory.largest, whole), memory.largest)
+            kept[..., -1, 1] = torch.where(some, torch.maximum(memory.recent, beyond), memory.recent)
+            memory = SurpriseMemory(kept)
             if bool((counts == 1).all()):
                 return memory, None
         if counts is None:

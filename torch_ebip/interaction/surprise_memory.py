@@ -25,7 +25,7 @@ BEFORE = 3.0
 ONE_SIDED = 6.0
 """What a difference with a direction is at most, as a multiple of what is usual: many small ones tell, not one."""
 PER_SENSOR = 6
-"""Numbers that are kept of a sensor, beside the sums of its DoFs."""
+"""Numbers that are kept of a sensor, before the sums of its DoFs."""
 STATES = ("ok", "suspect", "rejected")
 
 
@@ -33,38 +33,41 @@ class SurpriseMemory(NamedTuple):
     """What is remembered of S sensors, and of all of them together.
 
     Attributes:
-        sensors: [..., S, 6 + m], sums of multiples of what is usual and of samples, both discounted; how surprising
-            it is, a logarithm, 0 where it is as usual; what it counts, 0 to 1; the last multiple's logarithm; and
-            discounted more slowly, the sum of samples and those of differences of its DoFs, m at most.
-        together: [..., 2], how surprising they were together at most so far (0 suspect, 1 rejected); and by how much
-            that was beyond the body of its distribution, forgotten slowly.
+        kept: [..., S + 1, 6 + m], a row for each sensor: sums of multiples of what is usual and of samples, both
+            discounted; how surprising it is, a logarithm, 0 where it is as usual; what it counts, 0 to 1; the last
+            multiple's logarithm; and discounted more slowly, the sum of samples and those of differences of its
+            DoFs, m at most. The last row begins with what all are together: `largest` and `recent`.
     """
 
-    sensors: Tensor
-    together: Tensor
+    kept: Tensor
 
     def __repr__(self) -> str:
         return brief(self)
 
     @property
+    def sensors(self) -> Tensor:
+        """[..., S, 6 + m]."""
+        return self.kept[..., :-1, :]
+
+    @property
     def level(self) -> Tensor:
-        """[..., S]."""
-        return self.sensors[..., 2]
+        """[..., S], how surprising each sensor is."""
+        return self.kept[..., :-1, 2]
 
     @property
     def counts(self) -> Tensor:
-        """[..., S]."""
-        return self.sensors[..., 3]
+        """[..., S], what each counts."""
+        return self.kept[..., :-1, 3]
 
     @property
     def largest(self) -> Tensor:
-        """[...]; minus infinity before anything was seen."""
-        return self.together[..., 0]
+        """[...], how surprising they were together at most (0 suspect, 1 rejected); minus infinity at first."""
+        return self.kept[..., -1, 0]
 
     @property
     def recent(self) -> Tensor:
-        """[...], at least 0."""
-        return self.together[..., 1]
+        """[...], by how much that was beyond the body of its distribution, forgotten slowly."""
+        return self.kept[..., -1, 1]
 
 
 def state_of(counts: float) -> str:

@@ -82,6 +82,7 @@ class SpanCarrier(Carrier):
         self.matrix, self._moving = self._columns.matrix, self._columns.moving
         self._advance = part.dynamics.advancer(self._moving)
         self._mean: Tensor | None = None  # as it is; None: to be computed
+        self._products: Tensor | None = None  # of anomalies of what is measured, likewise
         E = start.shape[-2]
         self._draws = start.new_empty(*start.shape[:-1], m)
         self._draws_by_entry = self._draws.transpose(-1, -2)
@@ -93,7 +94,6 @@ class SpanCarrier(Carrier):
         self._process_versions = Versions(part.process_noise)
         batched = bool(self.batch_shape)
         self._add_product: Callable[..., Tensor] = Tensor.baddbmm_ if batched else Tensor.addmm_
-        self._plus_product: Callable[..., Tensor] = torch.baddbmm if batched else torch.addmm
         self._product: Callable[..., Tensor] = torch.bmm if batched else torch.mm
 
     @property
@@ -186,7 +186,8 @@ class SpanCarrier(Carrier):
     def variance(self) -> Tensor:
         """See `Carrier.variance`; what is NaN or infinite would pass for far off, so it is refused here."""
         self._plan.check_finite(self._seen)
-        return self._share * (self._plan.anomalies * self._weighted.transpose(-1, -2)).sum(-1)
+        self._products = products = self._product(self._plan.anomalies, self._weighted)
+        return self._share * products.diagonal(dim1=-2, dim2=-1)
 
     def move(
         self, rule: Rule, measured: Measured, taper: Taper | None, spread: Spread, perturbations: Tensor | None
@@ -199,7 +200,8 @@ class SpanCarrier(Carrier):
             y, believed = measured.y.unsqueeze(-1), measured.deviation.unsqueeze(-1)
             R = R + torch.diag_embed((believed.square() - deviation.square())[..., 0])
             deviation = believed
-        S = self._plus_product(R, plan.anomalies, weighted, alpha=self._share)
+        products = self._product(plan.anomalies, weighted) if self._products is None else self._products
+        S = torch.add(R, products, alpha=self._share)
         factor, info = torch.linalg.cholesky_ex(S)
         if bool(info.any() if self.batch_shape else info):
             self._explain(S, plan)
@@ -244,7 +246,7 @@ class SpanCarrier(Carrier):
         if weighting is not None:
             self._weighted = self._weighted * member_shares(self._weighted, weighting.weights)
             self._share = 1.0
-        self._plan, self._seen, self._deviation, self._R = plan, seen, deviation, R
+        self._plan, self._seen, self._deviation, self._R, self._products = plan, seen, deviation, R, None
         observed = None if seen is None else seen.squeeze(-1)
         self._measured = Measured(plan.values, observed, deviations, plan.rows)
         return self._measured
