@@ -68,8 +68,8 @@ class InteractionSurprise(SensorLevels):
         window: float = 0.15,
         bias_window: float = 0.5,
         memory: float = 1.0,
-        suspect: float = 0.01,
-        rejected: float = 0.001,
+        suspect: float = 0.03,
+        rejected: float = 0.005,
     ) -> None:
         super().__init__(mean, variance, noise, sensor_of_dof, window, bias_window, memory)
         self.suspect, self.rejected = as_chances(suspect, rejected).values()

@@ -48,8 +48,8 @@ def learn(
     ahead: Sequence[float] = AHEAD,
     memories: int = 2,
     scan: int = 48,
-    suspect: float = 0.01,
-    rejected: float = 0.001,
+    suspect: float = 0.03,
+    rejected: float = 0.005,
     ranks: Ranks | None = None,
     **tuning: Any,
 ) -> InteractionModel:
