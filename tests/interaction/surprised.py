@@ -11,7 +11,7 @@ from torch_ebip.interaction.surprise import POINTS
 
 def strict(primitive: InteractionPrimitive, above: float = 0.0, **settings: float) -> InteractionSurprise:
     """Calibrated with draws: sensors are suspect from about the usual on, or from a level above that."""
-    surprise = InteractionSurprise.of(primitive, **settings)
+    surprise = InteractionSurprise.of(primitive, **{"suspect": 0.01, "rejected": 0.001, **settings})
     draws = torch.Generator().manual_seed(0)
     like, S = primitive.weights, surprise.n_sensors
     usual = 0.5 + torch.rand(POINTS, 2, S, generator=draws, dtype=torch.float64)
