@@ -19,8 +19,11 @@ def strict(primitive: InteractionPrimitive, above: float = 0.0, **settings: floa
     largest[:, -1] = torch.nan  # what the robot controls is not shown
     whole = torch.rand(60, 1, generator=draws, dtype=torch.float64) - 0.5
     usual_bias = 0.05 + 0.1 * torch.rand(POINTS, S, generator=draws, dtype=torch.float64)
-    surprise.know(usual.to(like), usual_bias.to(like), largest.unsqueeze(-1).expand(-1, -1, 2).to(like))
-    surprise.know_whole(whole.expand(-1, 2).to(like))
+    # Biases and the pace on scales of their own, which must not matter.
+    both = torch.stack([largest, 1.7 * largest + 0.4], -1)
+    surprise.know(usual.to(like), usual_bias.to(like), both.to(like))
+    surprise.know_pace(torch.cat([whole, 0.6 * whole + 0.3], -1).to(like))
+    surprise.know_whole(whole.squeeze(-1).to(like))
     return surprise
 
 

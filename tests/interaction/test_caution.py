@@ -41,6 +41,12 @@ def test_chances_fall_from_one() -> None:
     assert 0 < float(said[-1]) < 1e-4
 
 
+def test_what_was_always_the_same_is_not_rare() -> None:
+    tail = Tail.fit(torch.full((40, 1), -1.5))
+    assert float(tail.above(torch.tensor([-1.5]))) > 0.9
+    assert float(tail.above(torch.tensor([-1.4]))) < 0.01
+
+
 def test_too_few_values_have_no_tail() -> None:
     with pytest.raises(ValueError, match="at least 20 finite values"):
         Tail.fit(torch.rand(19, 1))

@@ -20,6 +20,7 @@ from torch_ebip.interaction.surprise import InteractionSurprise
 from torch_ebip.interaction.surprise_memory import (
     ABSURD,
     ALONE,
+    BACK,
     BEFORE,
     HERE,
     LEAST_SAY,
@@ -55,6 +56,7 @@ class Oracle:
         self.sums = np.zeros(len(self.sensor))
         self.largest, self.recent = -math.inf, 0.0
         self.by_bias = self.by_pace = 0
+        self.counts = np.ones(S)
         self.body = float(surprise.tail.quantiles[0, -1])
 
     def forget(self, dt: float) -> None:
@@ -90,7 +92,9 @@ class Oracle:
                 bias = self.scale[0, s] + self.scale[1, s] * math.log(
                     max(bias / self.at(self.usual_bias, phase)[s], LEAST_SAY)
                 )
-                most = self.bounds[1, s] + math.log(MOST_BIAS)
+                low, high = self.bounds[:, s]
+                falls = 2 * self.scale[1, s] * BACK / self.surprise.bias_window
+                most = high + min(max(falls - (high - low), 0), math.log(MOST_BIAS))
                 if bias > most:
                     self.sums[theirs] *= math.exp(-0.5 * (bias - most) / self.scale[1, s])
                     bias = most
@@ -99,8 +103,8 @@ class Oracle:
         known = self.surprise.known.numpy()
         voices = [s for s in range(S) if self.samples[s] > HERE and known[s]]
         excess = (self.level - self.bounds[0]) / (self.bounds[1] - self.bounds[0])
-        middle = max(sorted(excess[voices])[(len(voices) - 1) // 2], 0.0) if voices else 0.0
-        counts = np.ones(S)
+        middle = max(sorted(excess[voices])[len(voices) // 2 if len(voices) > 2 else 0], 0.0) if voices else 0.0
+        counts = self.counts  # of those who say nothing as they were
         for s in voices:
             alone = (self.last[s] - self.bounds[1, s] - math.log(ALONE[0])) / math.log(ALONE[1] / ALONE[0])
             x = min(max(excess[s] - middle, alone, 0.0), 1.0)
@@ -112,11 +116,15 @@ class Oracle:
             offset, scale = self.surprise.pace_scale.tolist()
             self.by_pace += offset + scale * math.log1p(away**2) > whole
             whole = max(whole, offset + scale * math.log1p(away**2))
+            least = 1 / max(known.sum(), 2)
+            few = ((say**2).sum() / say.sum() ** 2 - least) / (1 - least)
+            offset, scale = self.surprise.alone_scale.tolist()
+            whole += min(max(few, 0.0), 1.0) * (offset + scale * whole)
             self.largest, self.recent = max(self.largest, whole), max(self.recent, whole - self.body)
-        return counts
+        return counts.copy()
 
 
-def conversation(count: int = 18, gaps: bool = True, seed: int = 3):
+def conversation(count: int = 24, gaps: bool = True, seed: int = 3):
     """Samples y, expected, variance [T, D] and phase [T] that surprise now and then."""
     draws = np.random.default_rng(seed)
     primitive = small_primitive(torch.float64)
@@ -138,6 +146,7 @@ def test_it_is_the_formula(form: str) -> None:
     """Levels, what sensors count and the whole: of a sequence, of a batch of them, and of the fast twin."""
     surprise = strict(small_primitive(torch.float64))
     surprise.usual_bias *= 0.3
+    surprise.alone_scale += torch.tensor([-0.2, -0.3])
     oracle = Oracle(surprise)
     y, expected, variance, phase = (torch.tensor(part) for part in conversation(gaps=form != "plain numbers"))
     memory = surprise.start(torch.zeros(*((2,) if form == "a batch" else ()), 3, 2, dtype=torch.float64))
@@ -368,3 +377,94 @@ def test_one_of_other_dofs_is_refused() -> None:
         part.check(model)
     with pytest.raises(ValueError, match=r"mean and variance must be \[P, 2\]"):
         InteractionSurprise(*torch.zeros(2, 4, 3), torch.ones(2), torch.zeros(2, dtype=torch.long), torch.ones(2))
+
+
+@pytest.mark.parametrize("scale", [0.2, 0.5, 0.9, 2.0])
+def test_a_bias_that_ends_is_forgotten_within_half_a_second(scale: float) -> None:
+    """However steep its scale: from the most that it can be to below what is suspect."""
+    surprise = strict(small_primitive(torch.float64))
+    surprise.bias_scale[1] = scale
+    hand = torch.tensor([0, 1])
+    memory, dt = surprise.start(torch.zeros(3, 2)), torch.tensor(0.02, dtype=torch.float64)
+    one, at = torch.ones(2, dtype=torch.float64), torch.tensor([0.3, 1.0], dtype=torch.float64)
+    mean = surprise.mean[round(0.3 * (len(surprise.mean) - 1)), :2]
+    for step in range(55):
+        memory = surprise.forget(memory, dt)
+        off = 5.0 if step < 30 else 0.0
+        memory, _, _ = surprise.update(memory, Noticed(mean + off, None, hand, mean, one, at))
+        if step == 29:
+            assert float(memory.level[0]) >= float(surprise.bounds[1, 0])
+    assert float(memory.level[0]) < float(surprise.bounds[0, 0])
+
+
+def test_who_is_silent_is_as_bad_as_before_in_a_batch_as_alone() -> None:
+    """Nothing is forgiven in silence, and nothing depends on who else is in the batch."""
+    primitive = small_primitive()
+    filter = cautious(primitive, square_root=True)
+    y = torch.where(primitive.layout.controlled, torch.nan, torch.stack(list(interactions(6, seed=5))[:1]))
+    y = torch.cat([y, y])[:, :25].clone()
+    y[0, 3:6, :2] += 9.0
+    y[0, 6:] = torch.nan
+    seen = ~y.isnan()
+    with torch.no_grad():
+        both = filter(y, seen, generator=[seeded(0), seeded(1)])
+        alone = filter(y[0], seen[0], generator=seeded(0))
+    assert float(alone.counts[5, 0]) == 0.0
+    assert (alone.counts[6:, 0] == 0).all()
+    torch.testing.assert_close(both.counts[0], alone.counts, atol=1e-4, rtol=0)
+
+
+def test_two_of_four_that_are_surprised_are_no_liars() -> None:
+    """Beside a sensor that says nothing of the movement: as many are surprised as are not."""
+    surprise = strict(small_primitive())
+    noticed = Noticed(torch.zeros(1), None, None, *torch.zeros(2, 1), torch.tensor([0.5, 1.0]))
+    surprise.bounds = torch.tensor([[0.0] * 4, [1.0] * 4])
+    surprise.known = torch.ones(4, dtype=torch.bool)
+    kept = torch.zeros(5, 8)
+    kept[:4, 1] = 1.0  # all are here
+    kept[:4, 2] = torch.tensor([2.0, 1.9, -3.0, -2.0])
+    kept[:4, 3] = 1.0
+    _, counts = surprise.verdict(SurpriseMemory(kept), noticed)
+    assert float(counts[:2].min()) > 0.9
+    kept[:4, 2] = torch.tensor([2.0, -1.9, -3.0, -2.0])
+    _, counts = surprise.verdict(SurpriseMemory(kept), noticed)
+    assert counts.tolist() == [0.0, 1.0, 1.0, 1.0]
+
+
+def test_time_that_is_written_over_is_noticed() -> None:
+    surprise = strict(small_primitive())
+    memory = SurpriseMemory(torch.ones_like(surprise.start(torch.zeros(3, 2)).kept))
+    dt = torch.tensor(0.1)
+    first = surprise.forget(memory, dt).kept
+    dt.fill_(1.0)
+    second = surprise.forget(memory, dt).kept
+    assert float(second[0, 0]) == pytest.approx(math.exp(-1.0 / surprise.window))
+    assert float(first[0, 0]) == pytest.approx(math.exp(-0.1 / surprise.window))
+    with torch.inference_mode():
+        surprise.forget(memory, dt)
+    weight = torch.ones((), requires_grad=True)
+    (surprise.forget(memory, dt).kept * weight).sum().backward()
+    assert weight.grad is not None
+
+
+def test_absurd_values_leave_gradients_finite() -> None:
+    primitive = small_primitive()
+    filter = cautious(primitive, square_root=True, residual_variance=100 * primitive.residual_variance)
+    y = torch.where(primitive.layout.controlled, torch.nan, interactions(3, seed=5)[1][:6].clone())
+    y[4, 0] = 1e18
+    forecast = filter.forecast(filter(y, generator=seeded(0)).state, 1.0)
+    (forecast.mean.sum() + forecast.variance.sum()).backward()
+    for name, parameter in filter.named_parameters():
+        assert parameter.grad is None or parameter.grad.isfinite().all(), name
+
+
+def test_another_default_device_changes_nothing() -> None:
+    primitive = small_primitive()
+    row = torch.where(primitive.layout.controlled, torch.nan, interactions(3, seed=5)[2][0])
+    said = []
+    for device in ("cpu", "meta"):
+        live = LiveFilter(cautious(primitive, square_root=True), generator=seeded(0))
+        with torch.device(device):
+            live.update(row)
+        said.append(live.carrier.memory.surprise.kept)
+    assert torch.equal(*said)

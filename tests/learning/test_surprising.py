@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from pathlib import Path
 
@@ -48,10 +49,10 @@ def taught():
 
 
 @torch.no_grad()
-def filtered(filter, demonstrations: Demonstrations, change=None):
+def filtered(filter, demonstrations: Demonstrations, change=None, sensors=("hand", "gaze")):
     """The trace of what sensors say, and the index of each one's last sample."""
     y, observed = demonstrations.pad()
-    seen = observed & ~demonstrations.layout.controlled
+    seen = observed & demonstrations.layout.mask(sensors)
     y = y if change is None else change(y)
     return filter(y, seen, generator=[seeded(0, i) for i in range(len(y))]), demonstrations.lengths - 1
 
@@ -68,6 +69,17 @@ def test_false_alarms_are_as_rare_as_was_said(taught) -> None:
     assert float((at_end < 0.2).double().mean()) >= 0.08
     suspect = (trace.counts[..., :2] < 1).any(1).double().mean(0)
     assert float(suspect.max()) <= 0.02 + 3 * math.sqrt(0.01 / 600)
+
+
+@pytest.mark.parametrize("sensor", ["hand", "gaze"])
+def test_one_sensor_alone_is_not_surprised_more_often(taught, sensor: str) -> None:
+    """As where a session has no others, or they were lost."""
+    filter, _, _ = taught
+    trace, last = filtered(filter, interactions(400, seed=13), sensors=(sensor,))
+    at_end = trace.familiarity.gather(1, last.unsqueeze(1)).squeeze(1)
+    for chance in (0.01, 0.05):
+        # Its tail is fitted to fifty interactions.
+        assert float((at_end < chance).double().mean()) <= 3 * chance + 3 * math.sqrt(chance * (1 - chance) / 400)
 
 
 def test_a_random_walk_and_a_sensor_that_lies_are_found(taught) -> None:
@@ -94,7 +106,7 @@ def test_a_random_walk_and_a_sensor_that_lies_are_found(taught) -> None:
 def test_what_is_learned_is_said(taught) -> None:
     filter, said, _ = taught
     assert said["sensors"] == ["hand", "gaze"]
-    assert said["chances"] == {"suspect": 0.01, "rejected": 0.001}
+    assert said["chances"] == {"suspect": 0.01, "rejected": 1 / 400}  # of a hundred interactions
     doubt = said["doubt"]
     assert doubt["share"][0] == 1.0
     assert doubt["widening"][0] == 0.0
@@ -109,10 +121,12 @@ def test_what_is_learned_is_said(taught) -> None:
 
 
 def test_calibration_judges_nobody_and_repeats(taught) -> None:
-    """What is noticed does not depend on what a filter made of it before, nor on the engine."""
+    """What is noticed does not depend on who judged before: with a judge and without one it is the same."""
     filter, _, held_out = taught
     again, _ = learn_surprise(held_out, filter, torch.arange(KNOWN))
-    once_more, _ = learn_surprise(held_out, filter, torch.arange(KNOWN))
+    alone = copy.deepcopy(filter)
+    alone.analysis.surprise = None
+    once_more, _ = learn_surprise(held_out, alone, torch.arange(KNOWN))
     for name, tensor in again.state_dict().items():
         if isinstance(tensor, torch.Tensor):
             assert torch.equal(tensor, once_more.state_dict()[name])
@@ -121,7 +135,7 @@ def test_calibration_judges_nobody_and_repeats(taught) -> None:
 def test_too_few_are_named_and_nothing_is_made_up() -> None:
     known = interactions(12)
     model = learn(known, steps=0, scan=4)
-    assert "familiarity is NaN: 12 demonstrations, at least 20 are needed" in " ".join(model.report["remarks"])
+    assert "familiarity is NaN: 12 demonstrations, at least 20 with" in " ".join(model.report["remarks"])
     assert model.report["surprise"] == {}
     with model.session() as session:
         session.push("hand", [0.0, 1.0], 0.0)
@@ -182,3 +196,36 @@ def test_strangers_are_what_they_are_called(taught) -> None:
     assert float((moved > 0.05).double().mean()) > 0.8
     assert all(torch.equal(strayed[i][:, 3:], known[i][:, 3:]) for i in range(KNOWN))
     np.testing.assert_allclose(strayed[1][[0, -1]], known[1][[0, -1]], atol=1e-5)
+
+
+def without(demonstrations: Demonstrations, sensor: str, count: int) -> Demonstrations:
+    """The first ``count`` never had that sensor."""
+    trajectories = [trajectory.clone() for trajectory in demonstrations]
+    for trajectory in trajectories[:count]:
+        trajectory[:, demonstrations.layout.slice(sensor)] = torch.nan
+    return Demonstrations(demonstrations.layout, trajectories, demonstrations.rate)
+
+
+def test_a_recording_without_a_sensor_of_a_set_says_nothing_of_it() -> None:
+    known = without(interactions(30), "gaze", 1)
+    model = learn(known, steps=0, scan=4, subsets={"both": ["hand", "gaze"], "gaze": ["gaze"]})
+    assert model.report["surprise"]["sensors"] == ["hand", "gaze"]
+    assert model.filter.surprise.tail is not None
+
+
+def test_a_sensor_that_few_recordings_have_is_named() -> None:
+    model = learn(without(interactions(30), "gaze", 18), steps=0, scan=4)
+    assert model.report["surprise"]["sensors"] == ["hand"]
+    assert "gaze is always believed: at least 20 demonstrations" in " ".join(model.report["remarks"])
+    assert model.report["surprise"]["chances"]["rejected"] == pytest.approx(1 / 120)
+
+
+def test_fewer_members_do_not_claim_to_know_what_is_familiar() -> None:
+    model = learn(interactions(24), steps=0, scan=4)
+    few, same = model.rebuilt(n_members=10), model.rebuilt(n_members=24)
+    assert (few.filter.surprise, few.filter.doubt) == (None, None)
+    assert "familiarity is NaN: it was learned with more than 10 members" in " ".join(few.report["remarks"])
+    assert few.report["surprise"] == {}
+    assert few.filter.bounds is not None
+    assert same.filter.surprise is not None
+    assert same.report["surprise"] == model.report["surprise"]

@@ -47,6 +47,34 @@ def test_a_sensor_that_lies_is_named_and_comes_back() -> None:
     assert 0 <= said.familiarity <= 1
 
 
+def test_who_was_rejected_stays_so_until_it_agrees() -> None:
+    """Not for being refused as out of range, nor for saying the same again and again, nor for silence."""
+    primitive = small_primitive()
+    settings = SessionSettings(margin=50.0, frozen_after=0.1)
+    with InteractionSession(honest(primitive, square_root=True), primitive, settings=settings) as session:
+        for k, row in enumerate(interactions(3, seed=5)[1][:30].tolist()):
+            session.push("hand", row[:2], k / 30)
+            # True, then off, then where nothing ever was, then off and frozen, then silent, then true.
+            wrong = 0.0 if k < 6 or k >= 18 else 1e6 if 8 <= k < 10 else 4.0
+            if not 16 <= k < 18:
+                session.push("gaze", [7.0 if 10 <= k < 16 else row[2] + wrong], k / 30)
+            said = session.forecast(now=k / 30).states["gaze"]
+            assert said == ("ok" if k < 6 else "rejected") or k == 6 or k >= 18, k
+        assert said == "ok"
+
+
+def test_who_is_refused_from_the_start_is_not_ok() -> None:
+    primitive = small_primitive()
+    with InteractionSession(ebip(primitive), primitive) as session:
+        for k, row in enumerate(interactions(3, seed=5)[1][:5].tolist()):
+            session.push("hand", row[:2], k / 30)
+            session.push("gaze", [1e6], k / 30)
+        assert session.forecast().states == {"hand": "ok", "gaze": "rejected"}
+        session.push("gaze", [row[2]], 0.2)
+        assert session.forecast().states == {"hand": "ok", "gaze": "ok"}
+        assert session.report()["gaze"].state == "ok"
+
+
 def test_familiarity_winds_back_with_late_samples_and_replays_to_the_bit(tmp_path) -> None:
     """Whatever the order of arrival, within the window, and from the recording: the same numbers."""
     primitive = small_primitive()

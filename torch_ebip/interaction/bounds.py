@@ -81,7 +81,7 @@ class Bounds(nn.Module):
         part = torch.where(out, outside, 0) / most
         kept = torch.where(out, most * torch.tanh(part), 0)
         taken = torch.minimum((outside - kept).abs(), width)
-        growth = taken.square() + part.square().clamp(max=1) * variance
+        growth = taken.square() + part.abs().clamp(max=1).square() * variance
         deviation = torch.where(out, forecast.variance + growth, forecast.variance).sqrt()
         widths = widths_of(forecast, variance)
         return moved(forecast, inside + kept, deviation, torch.ones_like(mean), widths)

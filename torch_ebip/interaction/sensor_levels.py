@@ -21,6 +21,7 @@ from torch_ebip.filtering.updates.surprise import Noticed, Surprise
 from torch_ebip.interaction.grid import between
 from torch_ebip.interaction.surprise_memory import (
     ABSURD,
+    BACK,
     BEFORE,
     LEAST_SAY,
     MOST,
@@ -99,7 +100,7 @@ class SensorLevels(Surprise):
         self.register_buffer("known", torch.zeros(S, dtype=torch.bool, device=mean.device))
         self.register_buffer("bounds", torch.stack([mean.new_zeros(S), mean.new_ones(S)]))
         self.most_dofs = int(same.sum(1).max())
-        self._kept: tuple[Tensor, Tensor] | None = None
+        self._kept: tuple[Tensor, int, Tensor] | None = None
 
     @property
     def n_sensors(self) -> int:
@@ -124,14 +125,20 @@ class SensorLevels(Surprise):
 
     def forget(self, memory: SurpriseMemory, dt: Tensor) -> SurpriseMemory:
         """See `Surprise.forget`, over dt [...] s."""
+        if dt.requires_grad or dt.is_inference() or torch.is_inference_mode_enabled():
+            return SurpriseMemory(memory.kept * self._left(dt))
         kept = self._kept  # another thread may exchange it
-        if kept is None or kept[0] is not dt:
-            one = torch.ones_like(dt)
-            window, bias, slowly = (torch.exp(-dt / s) for s in (self.window, self.bias_window, self.memory))
-            each = torch.stack([window, window, one, one, one, *[bias] * (1 + self.most_dofs)], -1)
-            whole = torch.stack([one, slowly, *[one] * (PER_SENSOR - 2 + self.most_dofs)], -1)
-            self._kept = kept = dt, torch.stack([*[each] * self.n_sensors, whole], -2)
-        return SurpriseMemory(memory.kept * kept[1])
+        if kept is None or kept[0] is not dt or kept[1] != dt._version:
+            self._kept = kept = dt, dt._version, self._left(dt)
+        return SurpriseMemory(memory.kept * kept[2])
+
+    def _left(self, dt: Tensor) -> Tensor:
+        """[..., S + 1, 6 + m], what is left after dt [...] s, as a share."""
+        one = torch.ones_like(dt)
+        window, bias, slowly = (torch.exp(-dt / s) for s in (self.window, self.bias_window, self.memory))
+        each = torch.stack([window, window, one, one, one, *[bias] * (1 + self.most_dofs)], -1)
+        whole = torch.stack([one, slowly, *[one] * (PER_SENSOR - 2 + self.most_dofs)], -1)
+        return torch.stack([*[each] * self.n_sensors, whole], -2)
 
     def squares(self, noticed: Noticed) -> tuple[Tensor, Tensor, Tensor]:
         """What a sample says of each sensor.
@@ -150,10 +157,11 @@ class SensorLevels(Surprise):
             moments = torch.cat([self.mean[:, rows], self.variance[:, rows]], -1)
             noise, sensors = noise[rows], sensors[rows]
         mean, variance = between(moments, noticed.mean[..., 0]).chunk(2, -1)
-        off = (y - noticed.expected) / (noticed.variance + noise).sqrt()
-        far = (y - mean).square() / (variance + noise)
-        # Infinity times nothing would reach other sensors.
-        both = torch.stack([off.square(), far], -2).clamp(max=ABSURD)
+        near = (y - noticed.expected) / (noticed.variance + noise).sqrt()
+        far = (y - mean) / (variance + noise).sqrt()
+        # Infinity times nothing would reach other sensors, and gradients.
+        off, far = (part.clamp(-math.sqrt(ABSURD), math.sqrt(ABSURD)) for part in (near, far))
+        both = torch.stack([off.square(), far.square()], -2)
         member = one_hot(sensors, self.n_sensors).to(both)
         if observed is None:
             count = member.sum(0).expand(*both.shape[:-2], -1)
@@ -198,13 +206,21 @@ class SensorLevels(Surprise):
         bias = (mean / usual[..., 2, :]).clamp(min=LEAST_SAY).log()
         if self.tail_known:  # what it is at most, for the same reason as a sample's
             offset, scale = self.bias_scale
-            beyond = offset + scale * bias - self.bounds[1] - math.log(MOST_BIAS)
+            beyond = offset + scale * bias - self.most_bias
             less = torch.where(seen & (beyond > 0), beyond / scale.clamp(min=1e-6), 0)
             bias, sums = bias - less, sums * torch.exp(-0.5 * less).unsqueeze(-1)
         level = torch.where(seen, torch.maximum(recent, self.bias_scale[0] + self.bias_scale[1] * bias), level)
         kept = torch.stack([total, samples, level, counts.expand_as(level), last, lately], -1)
         rows = torch.cat([torch.cat([kept, sums], -1), memory.kept[..., -1:, :].expand(*sums.shape[:-2], 1, -1)], -2)
         return SurpriseMemory(rows), seen, torch.stack([recent, bias], -1)
+
+    @property
+    def most_bias(self) -> Tensor:
+        """[S], the level that a bias has at most: one that ends falls below the first bound within `BACK`."""
+        low, high = self.bounds
+        falls: Tensor = 2 * self.bias_scale[1] * BACK / self.bias_window
+        most: Tensor = high + (falls - (high - low)).clamp(0, math.log(MOST_BIAS))
+        return most
 
     @property
     def dofs_of_sensor(self) -> Tensor:

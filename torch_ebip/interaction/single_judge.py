@@ -23,7 +23,6 @@ from torch_ebip.interaction.surprise_memory import (
     HERE,
     LEAST_SAY,
     MOST,
-    MOST_BIAS,
     ONE_SIDED,
     PER_SENSOR,
     SurpriseMemory,
@@ -65,8 +64,9 @@ class SingleJudge:
         self._bounds = surprise.bounds.double().T.tolist()
         self._dofs = surprise.dofs_of_sensor.tolist()
         self._most = [MOST * math.exp(high) for _, high in self._bounds]
-        most = (surprise.bounds[1:] + math.log(MOST_BIAS)).to(surprise.bias_scale)
-        self._scales: list[list[float]] = torch.cat([surprise.bias_scale, most]).double().T.tolist()
+        scales = torch.cat([surprise.bias_scale, surprise.most_bias.unsqueeze(0)])
+        self._scales: list[list[float]] = scales.double().T.tolist()
+        self._few, self._least = surprise.alone_scale.tolist(), 1 / max(int(surprise.known.sum()), 2)
         self._known = surprise.known.tolist()
         self._pace, self._pace_scale = surprise.pace.tolist(), surprise.pace_scale.tolist()
         assert surprise.tail is not None
@@ -106,33 +106,35 @@ class SingleJudge:
                 ours[4] = math.log(max(multiple, LEAST_SAY))
                 ours[5] += stride
                 ours[2] = max(math.log((ours[0] + 1) / (ours[1] + 1)), self._bias(s, ours, usual[2 * S + s]))
-            ours[3] = 1.0
             if known[s] and ours[1] > HERE:
                 first, second = self._bounds[s]
                 alone = (ours[4] - second - self._alone[0]) / self._alone[1]
                 excesses.append((s, (ours[2] - first) / (second - first), alone))
-        less = False
         if excesses:
             ordered = sorted(excess for _, excess, _ in excesses)
-            middle = max(ordered[(len(ordered) - 1) // 2], 0.0)
-            say = whole = 0.0
+            middle = max(ordered[len(ordered) // 2 if len(ordered) > 2 else 0], 0.0)
+            say = whole = squares = 0.0
             for s, excess, alone in excesses:
                 far_off = min(max(excess - middle, alone, 0.0), 1.0)
                 kept[s][3] = counts = 1 - far_off * far_off * (3 - 2 * far_off)
-                less = less or counts < 1
-                say += counts + LEAST_SAY
-                whole += excess * (counts + LEAST_SAY)
-            whole, together = max(whole / say, self._at_pace(moving)), kept[S]
+                weight = counts + LEAST_SAY
+                say += weight
+                squares += weight * weight
+                whole += excess * weight
+            whole /= say
+            few = min(max((squares / (say * say) - self._least) / (1 - self._least), 0.0), 1.0)
+            whole, together = max(whole, self._at_pace(moving)), kept[S]
+            whole += few * (self._few[0] + self._few[1] * whole)
             together[:2] = max(together[0], whole), max(together[1], whole - self._body)
         made = self._tensor(kept, memory.kept)
-        return made, made[:-1, 3] if less else None
+        return made, made[:-1, 3] if min(row[3] for row in kept[:-1]) < 1 else None
 
     @staticmethod
     def _tensor(rows: list[list[float]], like: Tensor) -> Tensor:
         """As torch.tensor makes it, in half of the time."""
         code = CODES.get(like.dtype)
         if code is None:
-            return torch.tensor(rows, dtype=like.dtype)
+            return torch.tensor(rows, dtype=like.dtype, device="cpu")
         return torch.frombuffer(array(code, chain.from_iterable(rows)), dtype=like.dtype).view_as(like)
 
     def _at_pace(self, moving: list[float]) -> float:
@@ -168,7 +170,7 @@ class SingleJudge:
         no others get their identity.
         """
         ours = self._surprise
-        chosen = torch.arange(len(ours.noise)) if rows is None else rows
+        chosen = torch.arange(len(ours.noise), device="cpu") if rows is None else rows
         noise, sensors = ours.noise[chosen].double(), ours.sensor_of_dof[chosen]
         places = PER_SENSOR + ours.place_of_dof[chosen]
         mean, spread = ours.mean[:, chosen].double(), ours.variance[:, chosen].double() + noise

@@ -56,6 +56,7 @@ class InteractionSurprise(SensorLevels):
 
     pace: Tensor
     pace_scale: Tensor
+    alone_scale: Tensor
     tail: Tail | None
 
     def __init__(
@@ -75,6 +76,7 @@ class InteractionSurprise(SensorLevels):
         self.suspect, self.rejected = as_chances(suspect, rejected).values()
         self.register_buffer("pace", owned(pace))
         self.register_buffer("pace_scale", pace.new_tensor([-math.inf, 0.0]))  # says nothing, see `bias_scale`
+        self.register_buffer("alone_scale", pace.new_zeros(2))
         self.tail = None
         self._single: SingleJudge | None = None
 
@@ -122,19 +124,40 @@ class InteractionSurprise(SensorLevels):
             self.known[sensor] = len(shown) >= FEWEST
             if not bool(self.known[sensor]):
                 continue
-            self.bias_scale[:, sensor], larger = on_one_scale(shown)
+            self.bias_scale[:, sensor] = scale = on_one_scale(*shown.unbind(-1))
+            larger = torch.maximum(shown[:, 0], scale[0] + scale[1] * shown[:, 1])
             tail = Tail.fit(larger.unsqueeze(-1))
             self.bounds[:, sensor] = torch.cat([tail.at(max(self.suspect, 2 * rejected)), tail.at(rejected)])
 
-    def know_whole(self, largest: Tensor) -> None:
-        """The tail of the whole.
+    def know_pace(self, largest: Tensor) -> None:
+        """On which scale the pace says as much as the sensors together.
 
         Args:
-            largest: [B, 2], of sensors together, and of the pace, in B interactions left out, see `verdict`.
+            largest: [B, 2], of sensors together and of the pace in B interactions left out, see `verdict`.
         """
-        scale, larger = on_one_scale(largest)
-        self.pace_scale.copy_(scale)
-        self.tail = Tail.fit(larger.unsqueeze(-1))
+        self.pace_scale.copy_(on_one_scale(*largest.unbind(-1)))
+
+    def know_alone(self, together: Tensor, alone: Tensor) -> None:
+        """On which scale an interaction of which one sensor tells is as surprising as one of which all do.
+
+        Args:
+            together: [A], the largest `whole` of interactions left out, all sensors shown.
+            alone: [B], the same with one of them shown.
+        """
+        scale = on_one_scale(together, alone)
+        self.alone_scale.copy_(torch.stack([scale[0], scale[1] - 1]))
+
+    def know_whole(self, largest: Tensor) -> None:
+        """The tail of the whole, from [B], the largest `whole` of interactions left out."""
+        self.tail = Tail.fit(largest.unsqueeze(-1))
+
+    def whole(self, parts: Tensor) -> Tensor:
+        """How surprising it is as a whole, [...], of parts [..., 3], see `verdict`."""
+        sensors, pace, few = parts.unbind(-1)
+        whole = torch.maximum(sensors, self.pace_scale[0] + self.pace_scale[1] * pace)
+        least = 1 / self.known.sum().clamp(min=2)
+        alone = ((few - least) / (1 - least)).clamp(0, 1)
+        return whole + alone * (self.alone_scale[0] + self.alone_scale[1] * whole)
 
     def check(self, model: StateSpace) -> None:
         """See `Part.check`: it is for as many DoFs as the model has."""
@@ -165,15 +188,16 @@ class InteractionSurprise(SensorLevels):
             memory, seen, _ = self.update(memory, noticed)
             if self.tail is None:
                 return memory, None
-            both, counts = self.verdict(memory, noticed)
-            whole = torch.maximum(both[..., 0], self.pace_scale[0] + self.pace_scale[1] * both[..., 1])
+            parts, counts = self.verdict(memory, noticed)
+            whole = self.whole(parts)
             beyond = (whole - self.tail.quantiles[0, -1]).clamp(min=0)
             some = seen.any(-1) & self.voices(memory).any(-1)
             kept = memory.kept.clone()
-            kept[..., :-1, 3] = counts
+            kept[..., :-1, 3] = torch.where(some.unsqueeze(-1), counts, memory.counts)
             kept[..., -1, 0] = torch.where(some, torch.maximum(memory.largest, whole), memory.largest)
             kept[..., -1, 1] = torch.where(some, torch.maximum(memory.recent, beyond), memory.recent)
             memory = SurpriseMemory(kept)
+            counts = memory.counts
             if bool((counts == 1).all()):
                 return memory, None
         if counts is None:
@@ -207,7 +231,8 @@ class InteractionSurprise(SensorLevels):
         return self.known & (memory.sensors[..., 1] > HERE)
 
     def verdict(self, memory: SurpriseMemory, noticed: Noticed) -> tuple[Tensor, Tensor]:
-        """How surprising sensors are together, and the pace, [..., 2]; and what sensors count, [..., S].
+        """How surprising sensors are together, and the pace, and one by the number of sensors that have a say,
+        [..., 3]; and what sensors count, [..., S].
 
         Args:
             memory: after the sample.
@@ -218,18 +243,21 @@ class InteractionSurprise(SensorLevels):
         excess = (level - low) / (high - low)
         ordered = torch.where(voices, excess, torch.inf).sort(-1).values
         number = voices.sum(-1, keepdim=True)
-        middle = ordered.gather(-1, (number - 1).clamp(min=0).div(2, rounding_mode="floor"))
+        # Of two the calmer one; of an even number beyond that the more surprised one of the two in the middle.
+        middle = ordered.gather(-1, torch.where(number > 2, number.div(2, rounding_mode="floor"), 0))
         middle = torch.where(number > 0, middle, 0).clamp(min=0)
         alone = (memory.sensors[..., 4] - high - math.log(ALONE[0])) / math.log(ALONE[1] / ALONE[0])
         part = torch.maximum(excess - middle, alone).clamp(0, 1)
-        counts = torch.where(voices, 1 - part.square() * (3 - 2 * part), 1)
+        # Who says nothing is neither better nor worse than before.
+        counts = torch.where(voices, 1 - part.square() * (3 - 2 * part), memory.counts)
         # A sensor that counts less says less of the interaction, too; where none counts all are asked again.
         say = voices * (counts + LEAST_SAY)
         whole = (torch.where(voices, excess, 0) * say).sum(-1) / say.sum(-1).clamp(min=LEAST_SAY)
+        few = say.square().sum(-1) / say.sum(-1).clamp(min=LEAST_SAY).square()
         pace = torch.zeros_like(whole)
         if noticed.mean.shape[-1] > 1:  # of phases that have a velocity
             pace = ((noticed.mean[..., 1] - self.pace[0]) / self.pace[1]).square().clamp(max=ABSURD).log1p()
-        return torch.stack([whole, pace], -1), counts
+        return torch.stack([whole, pace, few], -1), counts
 
     def __getstate__(self) -> dict[str, Any]:
         """Copies and pickles have nothing kept."""

@@ -11,7 +11,9 @@ from torch_ebip.common.brief import brief
 MOST = 5.0
 """What a sample adds to the mean at most, as a multiple of what rejects: a sensor that agrees again is soon back."""
 MOST_BIAS = 2.0
-"""What a bias is at most, likewise: it is forgotten more slowly."""
+"""What a bias is at most, likewise, as far as it is forgotten in time for that."""
+BACK = 0.5
+"""s, after which a sensor that agrees with what is expected without it is believed again."""
 ABSURD = 1e9
 """The largest multiple there is."""
 HERE = 0.1

@@ -19,9 +19,9 @@ FEWEST = 20
 class Tail(nn.Module):
     """Chances of a value above x: between quantiles as they were found, behind the last of them exponential.
 
-    Of logarithms an exponential tail is Pareto's, and its length is Hill's estimate (1975). The largest tenth of what
-    is behind the last quantile, one at least, is only known to be no smaller than the next one (Epstein and Sobel,
-    1953, of lives that are censored): a recording that is odd itself does not decide about all others.
+    Of logarithms an exponential tail is Pareto's, and its length is Hill's estimate (1975). The largest twentieth of
+    what is behind the last quantile, one at least, is only known to be no smaller than the next one (Epstein and
+    Sobel, 1953, of lives that are censored): a recording that is odd itself does not decide about all others.
 
     Args:
         quantiles: [G, Q], of G kinds at the probabilities `BODY`, not decreasing.
@@ -69,13 +69,13 @@ class Tail(nn.Module):
         return cls(quantiles.to(values), length.clamp(min=1e-3).to(values))
 
     def above(self, x: Tensor) -> Tensor:
-        """Chances [..., G] of more than x [..., G]; 1 below what was ever found."""
+        """Chances [..., G] of x [..., G] or more; 1 below what was ever found."""
         quantiles, Q = self.quantiles, len(BODY)
         flat = x.reshape(-1, len(quantiles)).T.contiguous()
-        right = torch.searchsorted(quantiles.contiguous(), flat, right=True).clamp(1, Q - 1)
+        right = torch.searchsorted(quantiles.contiguous(), flat).clamp(1, Q - 1)
         low, high = quantiles.gather(-1, right - 1), quantiles.gather(-1, right)
         steps = quantiles.new_tensor(BODY)
-        part = torch.where(high > low, (flat - low) / torch.where(high > low, high - low, 1), 1.0)
+        part = torch.where(high > low, (flat - low) / torch.where(high > low, high - low, 1), 0.0)
         within = 1 - torch.lerp(steps[right - 1], steps[right], part)
         excess = (flat - quantiles[:, -1:]).clamp(min=0)
         behind = (1 - BODY[-1]) * torch.exp(-excess / self.length.unsqueeze(-1))
@@ -96,28 +96,24 @@ class Tail(nn.Module):
 
 
 def _length(excess: Tensor) -> Tensor:
-    """[], of an exponential distribution of which these, ascending, were drawn, the largest tenth censored."""
+    """[], of an exponential distribution of which these, ascending, were drawn, the largest twentieth censored."""
     count = len(excess)
-    certain = count - math.ceil(count / 10)
+    certain = count - math.ceil(count / 20)
     if certain < 1:
         return excess.sum() / max(count, 1)
     return (excess[:certain].sum() + (count - certain) * excess[certain - 1]) / certain
 
 
-def on_one_scale(values: Tensor) -> tuple[Tensor, Tensor]:
-    """What brings the tail of a second kind of values to where that of the first begins, and to its length.
+def on_one_scale(first: Tensor, second: Tensor) -> Tensor:
+    """Offset and scale, [2], that bring the tail of values to where that of others begins, and to its length.
 
     Args:
-        values: [B, 2], at least `FEWEST` of them, finite.
-
-    Returns:
-        Offset and scale, [2], of the second; and the larger of both then, [B].
+        first: [A], the others, at least `FEWEST` of them, finite.
+        second: [B], the values, likewise.
     """
-    tail = Tail.fit(values)
-    (begin, other), (length, others) = tail.quantiles[:, -1], tail.length
-    scale = length / others
-    offset = begin - scale * other
-    return torch.stack([offset, scale]), torch.maximum(values[:, 0], offset + scale * values[:, 1])
+    tails = [Tail.fit(values.unsqueeze(-1)) for values in (first, second)]
+    scale = (tails[0].length / tails[1].length)[0]
+    return torch.stack([tails[0].quantiles[0, -1] - scale * tails[1].quantiles[0, -1], scale])
 
 
 def as_chances(suspect: float, rejected: float) -> dict[str, float]:

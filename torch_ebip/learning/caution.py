@@ -46,15 +46,30 @@ def learn_caution(
     surprise, said = learn_surprise(held_out, filter, interactions, **chances)
     if surprise is None:
         return {}, [too_few(len(demonstrations))]
+    shown = {name for names in held_out.task.subsets.values() for name in _modalities(held_out, names)}
+    remarks = [
+        f"{name} is always believed: at least {FEWEST} demonstrations must have it, to say what of it is usual"
+        for name in held_out.task.primitive.layout.names
+        if name in shown and name not in said["sensors"]
+    ]
     filter.analysis.surprise = surprise
     some = interactions[: max(FEWEST, MOST // len(held_out.task.subsets))]
     filter.doubt, doubt = learn_doubt(held_out, demonstrations, filter, some)
-    return {**said, "doubt": doubt}, []
+    return {**said, "doubt": doubt}, remarks
+
+
+def _modalities(held_out: HeldOut, dofs: Tensor) -> list[str]:
+    """Names of those of which some DoFs, bool [D], are shown."""
+    layout = held_out.task.primitive.layout
+    return [name for name in layout.names if bool(dofs[layout.slice(name)].any())]
 
 
 def too_few(count: int) -> str:
     """The line of a report that says why nothing can be said of familiarity."""
-    return f"familiarity is NaN: {count} demonstrations, at least {FEWEST} are needed to say what is familiar"
+    return (
+        f"familiarity is NaN: {count} demonstrations, at least {FEWEST} with something of every set of sensors are "
+        "needed to say what is familiar"
+    )
 
 
 @without_autocast

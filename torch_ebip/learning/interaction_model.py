@@ -254,7 +254,8 @@ class InteractionModel:
         """The same model with an ensemble of another size, or that weighs surprising values less.
 
         Args:
-            n_members: E; default: as it is.
+            n_members: E; default: as it is. With fewer nobody knows what is familiar: that was learned with all of
+                them, and fewer are surprised by everything.
             robust: `StudentT`, `Huber`, `Gate` or `Cauchy`, as they are; default: as it is.
 
         Raises:
@@ -262,12 +263,21 @@ class InteractionModel:
         """
         description = describe_filter(self.filter, self.primitive)
         own = tensors_of(self.filter)
+        report = self.report
         if n_members is not None:
             description["n_members"] = n_members
+            had = min(len(self.primitive), describe_filter(self.filter, self.primitive)["n_members"])
+            if n_members < had and description["surprise"] is not None:
+                description["surprise"] = description["doubt"] = None
+                own = {
+                    name: value for name, value in own.items() if not name.startswith(("analysis.surprise", "doubt"))
+                }
+                remark = f"familiarity is NaN: it was learned with more than {n_members} members"
+                report = Report({**report.plain(), "surprise": {}, "remarks": [*report.get("remarks", []), remark]})
         if robust is not None:
             description["robust"] = type(robust).__name__
             own = {name: tensor for name, tensor in own.items() if ".trust." not in name}
             own |= {f"analysis.trust.0.{name}": tensor for name, tensor in tensors_of(robust).items()}
         filter = build_filter(self.primitive, description).to(self.primitive.weights)
         fill(filter, own)
-        return replace(self, filter=filter)
+        return replace(self, filter=filter, report=report)

@@ -54,8 +54,21 @@ class Heard(NamedTuple):
         return brief(self)
 
 
-Conversation = tuple[list[Heard], int]
-"""What was heard of so many interactions."""
+class Conversation(NamedTuple):
+    """What was heard of some interactions.
+
+    Attributes:
+        heard: one after the other.
+        size: how many interactions.
+        alone: whether only one of several sensors was shown, beside the sets that were asked for.
+    """
+
+    heard: list[Heard]
+    size: int
+    alone: bool
+
+    def __repr__(self) -> str:
+        return brief(self)
 
 
 class _Listener(InteractionSurprise):
@@ -101,15 +114,29 @@ def learn_surprise(
     surprise.usual.copy_(_usual(surprise, conversations, held_out.ranks))
     usual_bias = _usual_bias(surprise, conversations, held_out.ranks)
     surprise.usual_bias.copy_(usual_bias)
-    largest = _largest(surprise, conversations, held_out.ranks)[0]
-    surprise.know(surprise.usual.clone(), usual_bias, largest, 1 / (FINEST * len(some)))
-    surprise.know_whole(_largest(surprise, conversations, held_out.ranks)[1])
+    largest, _, alone = _largest(surprise, conversations, held_out.ranks)
+    finest = 1 / (FINEST * len(some))
+    surprise.know(surprise.usual.clone(), usual_bias, largest[~alone], finest)
+    shown = (~largest.isnan().any(-1) & surprise.known).sum(-1)
+    _, parts, _ = _largest(surprise, conversations, held_out.ranks)
+    most = shown[~alone].sort(descending=True).values[FEWEST - 1]  # sensors that enough interactions have
+    if int(most) < 1:
+        return None, {}
+    together = (shown >= most) & ~alone
+    surprise.know_pace(parts[together, :2])
+    if int(most) > 1 and int((shown == 1).sum()) >= FEWEST:
+        # The larger of both has its largest where one of them has it.
+        whole = surprise.whole(parts[..., :3])
+        surprise.know_alone(whole[together], whole[shown == 1])
+    whole = _largest(surprise, conversations, held_out.ranks)[1][:, 3]
+    surprise.know_whole(whole[~alone & (shown > 0)])
     assert surprise.tail is not None
+    rejected = max(surprise.rejected, finest)
     names = [name for name, known in zip(primitive.layout.names, surprise.known.tolist(), strict=True) if known]
     return surprise, {
         "interactions": len(some),
         "sensors": names,
-        "chances": {"suspect": surprise.suspect, "rejected": surprise.rejected},
+        "chances": {"suspect": max(surprise.suspect, 2 * rejected), "rejected": rejected},
         "largest": [round(value, 4) for value in surprise.tail.quantiles[0].tolist()],
     }
 
@@ -127,20 +154,34 @@ def listen(
     hearing.analysis.surprise = listener
     found = []
     end = torch.ones(1, device="cpu")
-    for subset in held_out.task.subsets.values():
-        for shown in whole.portions(interactions, subset, end):
+    sets = [(subset, interactions, False) for subset in held_out.task.subsets.values()]
+    sets += [(subset, interactions[:some], True) for subset, some in _alone(held_out)]
+    for subset, some, alone in sets:
+        for shown in whole.portions(some, subset, end):
             heard: list[Heard] = []
             listener.heard = heard
             whole.filter(hearing, shown, -1)
-            found.append((heard, len(shown.interactions)))
+            found.append(Conversation(heard, len(shown.interactions), alone))
     return found
+
+
+def _alone(held_out: HeldOut) -> list[tuple[Tensor, int]]:
+    """Each sensor by itself, bool [D], where there are several and that is no set already, and for how many."""
+    layout, subsets = held_out.task.primitive.layout, held_out.task.subsets.values()
+    shown = torch.stack(list(subsets)).any(0)
+    each = [shown & layout.mask([name]).to(shown.device) for name in layout.names]
+    each = [one for one in each if bool(one.any())]
+    if len(each) < 2:
+        return []
+    count = max(FEWEST, MOST // (2 * len(each)))
+    return [(one, count) for one in each if not any(torch.equal(one, subset) for subset in subsets)]
 
 
 def _usual(surprise: InteractionSurprise, conversations: list[Conversation], ranks: Ranks) -> Tensor:
     """[P, 2, S], means of both squares at the phases of the grid, smoothed."""
     sums = surprise.usual.new_zeros(2, *surprise.usual.shape).double()
-    for heard, _ in conversations:
-        for by, noticed, _ in heard:
+    for conversation in conversations:
+        for by, noticed, _ in conversation.heard if not conversation.alone else ():
             if noticed is not None:
                 squares, here, _ = by.squares(noticed)
                 _add(sums, noticed, squares, here.unsqueeze(-2))
@@ -150,8 +191,8 @@ def _usual(surprise: InteractionSurprise, conversations: list[Conversation], ran
 def _usual_bias(surprise: InteractionSurprise, conversations: list[Conversation], ranks: Ranks) -> Tensor:
     """[P, S], the mean square of the bias at the phases of the grid, smoothed."""
     sums = surprise.usual.new_zeros(2, *surprise.usual_bias.shape).double()
-    for heard, count in conversations:
-        for noticed, _, here, both in _told(surprise, heard, count):
+    for heard, count, alone in conversations:
+        for noticed, _, here, both in _told(surprise, heard, count) if not alone else ():
             _add(sums, noticed, both[..., 1].exp(), here)
     return _smoothed(sums, ranks).to(surprise.usual)
 
@@ -175,24 +216,29 @@ def _smoothed(sums: Tensor, ranks: Ranks) -> Tensor:
     return torch.maximum(total / counts.clamp(min=1e-9), LEAST_USUAL * overall)
 
 
-def _largest(surprise: InteractionSurprise, conversations: list[Conversation], ranks: Ranks) -> tuple[Tensor, Tensor]:
-    """The largest logarithms of each sensor [B, S, 2], NaN where it was not shown, and of the whole [B, 2]."""
-    found = [_largest_of(surprise, heard, count) for heard, count in conversations]
-    everyone = [pair for rank in ranks.gather([[part.cpu() for part in pair] for pair in found]) for pair in rank]
-    logarithms, whole = (torch.cat(parts).to(surprise.usual) for parts in zip(*everyone, strict=True))
-    return logarithms, whole
+def _largest(
+    surprise: InteractionSurprise, conversations: list[Conversation], ranks: Ranks
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The largest logarithms of each sensor [B, S, 2], NaN where it was not shown; of each part of the whole and of
+    the whole [B, 4]; and whether one sensor was alone, bool [B]."""
+    found = [_largest_of(surprise, conversation) for conversation in conversations]
+    everyone = [parts for rank in ranks.gather([[part.cpu() for part in parts] for parts in found]) for parts in rank]
+    logarithms, whole, alone = (torch.cat(parts).to(surprise.noise.device) for parts in zip(*everyone, strict=True))
+    return logarithms, whole, alone
 
 
-def _largest_of(surprise: InteractionSurprise, heard: list[Heard], count: int) -> tuple[Tensor, Tensor]:
-    """The same of one conversation about so many interactions."""
+def _largest_of(surprise: InteractionSurprise, conversation: Conversation) -> tuple[Tensor, Tensor, Tensor]:
+    """The same of one conversation."""
+    heard, count, alone = conversation
     lowest = surprise.noise.new_full((count,), -torch.inf)
-    largest, whole = lowest[:, None, None].expand(-1, surprise.n_sensors, 2), lowest[:, None].expand(-1, 2)
+    largest, whole = lowest[:, None, None].expand(-1, surprise.n_sensors, 2), lowest[:, None].expand(-1, 4)
     for noticed, memory, here, both in _told(surprise, heard, count):
         seen = here > 0
         largest = torch.where(seen.unsqueeze(-1), torch.maximum(largest, both), largest)
-        now, _ = surprise.verdict(memory, noticed)
-        whole = torch.where(seen.any(-1, keepdim=True), torch.maximum(whole, now), whole)
-    return torch.where(largest.isinf(), torch.nan, largest), whole
+        parts, _ = surprise.verdict(memory, noticed)
+        parts = torch.cat([parts, surprise.whole(parts).unsqueeze(-1)], -1)
+        whole = torch.where(seen.any(-1, keepdim=True), torch.maximum(whole, parts), whole)
+    return torch.where(largest.isinf(), torch.nan, largest), whole, torch.full_like(lowest, alone, dtype=torch.bool)
 
 
 def _told(

@@ -27,7 +27,8 @@ class SessionForecast(NamedTuple):
         labels: probability of each of the labelled interactions, by name; empty where there are none.
         familiarity: 0 to 1, the chance of a surprise as large as the largest so far in an interaction like those
             demonstrated; below .01 hardly any of those is. NaN where it was not calibrated, see `learn`.
-        states: of each sensor "ok", "suspect" (it counts less) or "rejected" (nothing, until it agrees again).
+        states: of each sensor "ok", "suspect" (it counts less) or "rejected" (nothing, until it agrees again;
+            also where the last of it was refused: out of range, or the same for too long).
     """
 
     time: float

@@ -72,6 +72,7 @@ class Freshness:
         since: int64 [M], the tick since which each modality has said the same.
         used: int64 [M], the tick at which each modality was used last; -1 if never.
         frozen: int64 [M], how often each was refused.
+        still: bool [M], whether what each said last was.
         failed: how many ticks the filter could not take in.
     """
 
@@ -79,11 +80,13 @@ class Freshness:
     since: npt.NDArray[np.int64]
     used: npt.NDArray[np.int64]
     frozen: npt.NDArray[np.int64]
+    still: npt.NDArray[np.bool_]
     failed: int = 0
 
     def copy(self) -> Freshness:
         """Of its own memory."""
-        return Freshness(self.values.copy(), self.since.copy(), self.used.copy(), self.frozen.copy(), self.failed)
+        counts = self.since.copy(), self.used.copy(), self.frozen.copy()
+        return Freshness(self.values.copy(), *counts, self.still.copy(), self.failed)
 
 
 @dataclass
@@ -113,6 +116,7 @@ class Intake:
         self.columns, self.ranges, self.start, self.dt = columns, ranges, start, dt
         self.behind, self.ahead = behind, ahead
         self.reports = [SensorReport() for _ in columns]
+        self._newest = [(-math.inf, False)] * len(columns)
         D = len(ranges.low)
         self._ring = [_Slot(np.full(D, np.nan)) for _ in range(behind + ahead + 2)]
         self._nothing = np.full(D, np.nan)
@@ -135,7 +139,10 @@ class Intake:
         if vector is None or not math.isfinite(moment):
             report.malformed += 1
             return None
+        missing = np.isnan(vector).all()
         vector = self._plausible(vector, columns, report)
+        impossible = bool(np.isnan(vector).all() and not missing)
+        self._newest[modality] = max(self._newest[modality], (moment, impossible))
         place = (moment - self.start) / self.dt
         if place < -0.5 or place > head + self.ahead:
             report.early += 1
@@ -160,6 +167,11 @@ class Intake:
         slot.values[columns] = vector
         return tick
 
+    @property
+    def impossible(self) -> list[bool]:
+        """Whether all that each modality measured last could not be: infinite, or out of range."""
+        return [impossible for _, impossible in self._newest]
+
     def says_something(self, modality: int, values: Any, time: Any) -> bool:
         """Whether a sample of a sensor has a time and a value that can be; nothing is counted or stored.
 
@@ -182,7 +194,8 @@ class Intake:
     def fresh(self) -> Freshness:
         """Before anything was said."""
         M = len(self.columns)
-        return Freshness(self._nothing.copy(), np.zeros(M, np.int64), np.full(M, -1, np.int64), np.zeros(M, np.int64))
+        none = np.zeros(M, np.int64)
+        return Freshness(self._nothing.copy(), none, np.full(M, -1, np.int64), none.copy(), np.zeros(M, np.bool_))
 
     def usable(
         self, tick: int, freshness: Freshness, patience: Sequence[float]
@@ -204,7 +217,8 @@ class Intake:
             if not common.any() or (said[common] != before[common]).any():
                 freshness.since[m] = tick
             before[usable[columns]] = said[usable[columns]]
-            if (tick - freshness.since[m]) * self.dt > patience[m]:
+            freshness.still[m] = (tick - freshness.since[m]) * self.dt > patience[m]
+            if freshness.still[m]:
                 freshness.frozen[m] += 1
                 usable[columns] = False
             else:

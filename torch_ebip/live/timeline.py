@@ -178,7 +178,9 @@ class Timeline:
     def states(self) -> list[str]:
         """Of each sensor, see `SessionForecast`."""
         counts = self._engine.counts()
-        return [STATES[0] if counts is None else state_of(counts[number]) for number in self._modalities]
+        states = [STATES[0] if counts is None else state_of(counts[number]) for number in self._modalities]
+        refused = zip(self._intake.impossible, self._current().still.tolist(), strict=True)
+        return [STATES[2] if any(why) else state for why, state in zip(refused, states, strict=True)]
 
     def stale(self) -> list[int]:
         """Numbers of the sensors of which nothing was used for a while, or ever."""
