@@ -51,6 +51,6 @@ def faults_figure(results: Mapping[str, Any], method: str) -> Figure:
     axis.grid(axis="y", which="both", alpha=0.2)
     axis.set_xticks(range(len(sensors)), [plain(sensor) for sensor in sensors], rotation=20, ha="right")
     axis.set_ylabel(plain(f"{method}: mean squared error\nof {target} at the end [{error['clean']['unit']}]"))
-    axis.legend(fontsize=8, ncols=2)
+    axis.legend(fontsize=8, ncols=2, loc="upper left")
     axis.spines[["top", "right"]].set_visible(False)
     return figure
