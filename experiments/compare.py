@@ -2,8 +2,9 @@
 
 Methods: `bip`, `particle_filter`, `ebip_minus` and `ebip` are the paper's; `ebip_scaled` is eBIP with R times the
 best single factor; `ebip_tuned` and `particle_filter_tuned` are tuned by gradient; all of that happens inside each
-fold, never on its test part. `mean`, `nearest`, `ridge`, `trees`, `gru` and, for the simulated ball, `ballistic`
-are what one would try without a filter. Without --data the recordings are the simulated ball catching.
+fold, never on its test part. `mean`, `nearest`, `ridge`, `trees`, `trees_untold` (not told which share they see),
+`gru` and, for the simulated ball, `ballistic` are what one would try without a filter. Without --data the recordings
+are the simulated ball catching.
 
 `torchrun --nproc-per-node K -m experiments.compare` shares the folds among K processes; the result is the same.
 """

@@ -17,6 +17,7 @@ from experiments.baselines import (
     RecurrentSettings,
     RidgeMethod,
     TreesMethod,
+    UntoldTreesMethod,
 )
 from experiments.evaluate import FilterMethod, MeanMethod, Method, NearestMethod, Task
 from torch_ebip import (
@@ -203,6 +204,9 @@ METHODS: dict[str, Callable[[Fold], Method | None]] = {
     "ballistic": _ballistic,
     "ridge": lambda fold: RidgeMethod(fold.known, fold.tuned().targets.cpu(), fold.task.fractions, fold.ahead),
     "trees": lambda fold: TreesMethod(
+        fold.known, fold.tuned().targets.cpu(), fold.task.fractions, fold.ahead, seed=fold.seed
+    ),
+    "trees_untold": lambda fold: UntoldTreesMethod(
         fold.known, fold.tuned().targets.cpu(), fold.task.fractions, fold.ahead, seed=fold.seed
     ),
     "gru": _gru,

@@ -23,6 +23,7 @@ COLOURS = {
     "ballistic": "black",
     "ridge": "tab:olive",
     "trees": "tab:green",
+    "trees_untold": "yellowgreen",
     "gru": "tab:cyan",
     "bip": "tab:brown",
     "particle_filter": "tab:purple",

@@ -3,6 +3,13 @@
 from experiments.baselines.ballistic import BallisticMethod
 from experiments.baselines.network import RecurrentSettings
 from experiments.baselines.recurrent import RecurrentMethod
-from experiments.baselines.regression import RidgeMethod, TreesMethod
+from experiments.baselines.regression import RidgeMethod, TreesMethod, UntoldTreesMethod
 
-__all__ = ["BallisticMethod", "RecurrentMethod", "RecurrentSettings", "RidgeMethod", "TreesMethod"]
+__all__ = [
+    "BallisticMethod",
+    "RecurrentMethod",
+    "RecurrentSettings",
+    "RidgeMethod",
+    "TreesMethod",
+    "UntoldTreesMethod",
+]

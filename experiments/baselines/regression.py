@@ -1,8 +1,8 @@
 """Regression on a fixed share of the interaction: what anyone would try before a filter.
 
-Both methods learn a regressor for each set of sensors and each share of the interaction that they are asked about,
-from training demonstrations cut at that share of their own length. They are told two things that no filter knows:
-where in the interaction they stand, and that no other question will come.
+Methods learn a regressor for each set of sensors and each share of the interaction that they are asked about, from
+training demonstrations cut at that share of their own length. They are told two things that no filter knows: where in
+the interaction they stand, and that no other question will come. `UntoldTreesMethod` is told neither.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from experiments.baselines.common import Array, futures, kept_steps, places_of, 
 from experiments.evaluate import END, Answer
 from torch_ebip import Demonstrations
 
+SHARES = tuple(round(0.1 * k, 1) for k in range(1, 11))
+"""At which demonstrations are cut for those who are not told where they stand."""
 ALPHAS = tuple(float(alpha) for alpha in np.logspace(-1, 5, 25))
 """Grid of the ridge penalty, for standardised features and targets."""
 
@@ -45,7 +47,7 @@ class _RegressionMethod(ABC):
         self._demonstrations = demonstrations
         self._values, self._measured = demonstrations.pad()
         self._lengths, self._rate = demonstrations.lengths, demonstrations.rate
-        self._fitted: dict[tuple[tuple[bool, ...], float], _Regression] = {}
+        self._fitted: dict[tuple[tuple[bool, ...], tuple[float, ...]], _Regression] = {}
 
     def __call__(
         self, y: Tensor, observed: Tensor, keep: Tensor, dofs: Tensor, ahead: Sequence[float] = END
@@ -72,15 +74,23 @@ class _RegressionMethod(ABC):
 
     def fit(self, shown: Tensor, fraction: float) -> _Regression:
         """The regression of the targets on the shown DoFs, bool [D], at a fraction of the interaction."""
-        key = (tuple(shown.tolist()), fraction)
+        cuts = self._cuts(fraction)
+        key = (tuple(shown.tolist()), cuts)
         if key not in self._fitted:
-            keep = kept_steps(self._lengths, fraction)
-            seen = until(self._measured, keep)[..., shown]
-            features = self._features(self._values[..., shown], seen, keep)
-            wanted = futures(self._demonstrations, keep.unsqueeze(-1), self.ahead, self.targets).flatten(1)
+            features, wanted = [], []
+            for cut in cuts:
+                keep = kept_steps(self._lengths, cut)
+                seen = until(self._measured, keep)[..., shown]
+                features.append(self._features(self._values[..., shown], seen, keep))
+                later = futures(self._demonstrations, keep.unsqueeze(-1), self.ahead, self.targets).flatten(1)
+                wanted.append(later.double().numpy())
             # What lies behind the end for nearly all cannot be learned; the mean of the few is all that is said.
-            self._fitted[key] = _Regression(self._regressor, features, wanted.double().numpy())
+            self._fitted[key] = _Regression(self._regressor, np.concatenate(features), np.concatenate(wanted))
         return self._fitted[key]
+
+    def _cuts(self, fraction: float) -> tuple[float, ...]:
+        """At which shares demonstrations are cut to answer at one."""
+        return (fraction,)
 
     @abstractmethod
     def _features(self, y: Tensor, seen: Tensor, keep: Tensor) -> Array:
@@ -162,6 +172,13 @@ class TreesMethod(_RegressionMethod):
             random_state=self.seed,
             n_jobs=1,
         )
+
+
+class UntoldTreesMethod(TreesMethod):
+    """The same trees for every moment: learned at ten shares of the interaction, told none, as a filter is."""
+
+    def _cuts(self, fraction: float) -> tuple[float, ...]:
+        return SHARES
 
 
 class _Regression:

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from experiments.baselines import BallisticMethod, RecurrentMethod, RecurrentSettings, RidgeMethod, TreesMethod
+from experiments.baselines import (
+    BallisticMethod,
+    RecurrentMethod,
+    RecurrentSettings,
+    RidgeMethod,
+    TreesMethod,
+    UntoldTreesMethod,
+)
 from experiments.baselines.regression import last_values, resampled_prefix
 from experiments.evaluate import MeanMethod, Method, Task, evaluate
 from tests.conftest import interactions, layout, small_primitive
@@ -26,6 +33,7 @@ def learned() -> dict[str, Method]:
     return {
         "ridge": RidgeMethod(made, targets, FRACTIONS, AHEAD),
         "trees": TreesMethod(made, targets, FRACTIONS, AHEAD, trees=50),
+        "trees_untold": UntoldTreesMethod(made, targets, FRACTIONS, AHEAD, trees=50),
         "gru": RecurrentMethod(made, targets, subsets, QUICK, AHEAD),
     }
 
@@ -44,6 +52,7 @@ def test_they_learn(methods: dict[str, Method]) -> None:
         mean = np.nanmean(values[cell]["mean"])
         assert np.nanmean(values[cell]["ridge"]) < 0.25 * mean
         assert np.nanmean(values[cell]["trees"]) < 0.5 * mean
+        assert np.nanmean(values[cell]["trees_untold"]) < 0.6 * mean
         assert np.nanmean(values[cell]["gru"]) < (0.5 if cell.ahead is None else 0.6) * mean
     covered = next(values[cell]["gru"].mean() for cell in values if cell.metric == "coverage_95")
     assert 0.8 < covered <= 1
@@ -65,6 +74,20 @@ def test_nobody_reads_what_is_not_shown(methods: dict[str, Method]) -> None:
         )
         assert torch.equal(early.forecast.mean[:, 0], a[:, 0]), name
         assert not torch.equal(early.forecast.mean[:, 1], a[:, 1]), name
+
+
+def test_untold_trees_do_not_know_how_much_they_see(methods: dict[str, Method]) -> None:
+    """One regressor answers at every share, and the same samples get the same answer whatever share they are."""
+    trees = methods["trees_untold"]
+    assert isinstance(trees, UntoldTreesMethod)
+    shown = torch.tensor([True, True, False, False, False])
+    assert trees.fit(shown, 0.43) is trees.fit(shown, 0.82)
+    y, measured = interactions(4, seed=5).pad()
+    observed = measured & shown & (torch.arange(y.shape[1]) <= 15).view(1, -1, 1)
+    said = trees(y, observed, torch.tensor([[15, 15]] * 4), layout().mask(["arm"])).forecast.mean
+    assert torch.equal(said[:, 0], said[:, 1])
+    told = methods["trees"](y, observed, torch.tensor([[15, 15]] * 4), layout().mask(["arm"])).forecast.mean
+    assert not torch.equal(told[:, 0], told[:, 1])
 
 
 def test_nothing_shown_is_the_mean(methods: dict[str, Method]) -> None:
