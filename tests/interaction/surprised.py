@@ -21,7 +21,9 @@ def strict(primitive: InteractionPrimitive, above: float = 0.0, **settings: floa
     usual_bias = 0.05 + 0.1 * torch.rand(POINTS, S, generator=draws, dtype=torch.float64)
     # Biases and the pace on scales of their own, which must not matter.
     both = torch.stack([largest, 1.7 * largest + 0.4], -1)
-    surprise.know(usual.to(like), usual_bias.to(like), both.to(like))
+    surprise.usual.copy_(usual)
+    surprise.usual_bias.copy_(usual_bias)
+    surprise.know(both.to(like))
     surprise.know_pace(torch.cat([whole, 0.6 * whole + 0.3], -1).to(like))
     surprise.know_whole(whole.squeeze(-1).to(like))
     return surprise

@@ -93,6 +93,16 @@ def test_bounds_move_members_too_and_take_no_unit_for_another() -> None:
         Bounds(torch.ones(1), torch.zeros(1))
 
 
+def test_far_outside_a_range_of_no_width_gradients_are_finite() -> None:
+    """A DoF that never moved: where it is said to be is held, and what was said gets no NaN."""
+    mean = torch.tensor([[7.0]], requires_grad=True)
+    said = Forecast(mean, torch.tensor([[0.5]]), torch.ones(1))
+    held = Bounds(torch.tensor([2.0]), torch.tensor([2.0]))(said, torch.tensor([[0.1]]))
+    assert float(held.mean) == 2.0
+    (held.mean + held.variance).sum().backward()
+    assert mean.grad.isfinite().all()
+
+
 def test_the_range_is_that_of_the_demonstrations() -> None:
     primitive = small_primitive(torch.float64)
     low, high = demonstrated_range(primitive)

@@ -414,6 +414,29 @@ def test_who_is_silent_is_as_bad_as_before_in_a_batch_as_alone() -> None:
     torch.testing.assert_close(both.counts[0], alone.counts, atol=1e-4, rtol=0)
 
 
+def test_who_is_silent_while_others_speak_is_not_forgiven() -> None:
+    primitive = small_primitive()
+    filter = cautious(primitive, square_root=True)
+    y = torch.where(primitive.layout.controlled, torch.nan, interactions(6, seed=5)[0][:25].clone())
+    y[3:6, :2] += 9.0
+    y[6:, :2] = torch.nan
+    with torch.no_grad():
+        assert (filter(y, generator=seeded(0)).counts[5:, 0] == 0).all()
+    assert (filter(y, generator=seeded(0)).counts[5:, 0] == 0).all()
+
+
+def test_an_entry_of_which_nothing_was_measured_stays_as_it_was() -> None:
+    """Although a verdict on it would be another one by now: the sensor beside which it lied has no voice any more."""
+    surprise = strict(small_primitive())
+    kept = surprise.start(torch.zeros(2, 3, 2)).kept.clone()
+    kept[0, 0, 1], kept[0, 0, 2], kept[0, 0, 3] = 1.0, float(surprise.bounds[1, 0]) + 0.1, 0.0
+    observed = torch.tensor([[False] * 5, [True, True, True, False, False]])
+    noticed = Noticed(torch.zeros(2, 5), observed, None, *torch.zeros(2, 2, 5) + 1, torch.tensor([[0.3, 1.0]] * 2))
+    memory, _ = surprise.judge(SurpriseMemory(kept), noticed)
+    assert torch.equal(memory.kept[0], kept[0])
+    assert not torch.equal(memory.kept[1], kept[1])
+
+
 def test_two_of_four_that_are_surprised_are_no_liars() -> None:
     """Beside a sensor that says nothing of the movement: as many are surprised as are not."""
     surprise = strict(small_primitive())

@@ -106,18 +106,14 @@ class InteractionSurprise(SensorLevels):
         """What `of` takes."""
         return {name: getattr(self, name) for name in ("window", "bias_window", "memory", "suspect", "rejected")}
 
-    def know(self, usual: Tensor, usual_bias: Tensor, largest: Tensor, finest: float = 0.0) -> None:
-        """Bounds of the sensors; it judges from when it knows the whole, too.
+    def know(self, largest: Tensor, finest: float = 0.0) -> None:
+        """Bounds of the sensors, of which `usual` and `usual_bias` are known; it judges from `know_whole` on.
 
         Args:
-            usual: [P, 2, S], what is usual of both squares at the phases of the grid.
-            usual_bias: [P, S], what is usual of the square of the bias.
             largest: [B, S, 2], the largest logarithms of each sensor in B interactions left out, see `update`; NaN:
                 not shown.
             finest: the smallest chance that they tell: a smaller one is not looked for in their tail.
         """
-        self.usual.copy_(usual)
-        self.usual_bias.copy_(usual_bias)
         rejected = max(self.rejected, finest)
         for sensor in range(self.n_sensors):
             shown = largest[:, sensor][~largest[:, sensor].isnan().any(-1)]

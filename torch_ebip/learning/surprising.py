@@ -112,11 +112,10 @@ def learn_surprise(
     some = interactions[: max(FEWEST, MOST // len(held_out.task.subsets))]
     conversations = listen(held_out, filter, some, primitive)
     surprise.usual.copy_(_usual(surprise, conversations, held_out.ranks))
-    usual_bias = _usual_bias(surprise, conversations, held_out.ranks)
-    surprise.usual_bias.copy_(usual_bias)
+    surprise.usual_bias.copy_(_usual_bias(surprise, conversations, held_out.ranks))
     largest, _, alone = _largest(surprise, conversations, held_out.ranks)
     finest = 1 / (FINEST * len(some))
-    surprise.know(surprise.usual.clone(), usual_bias, largest[~alone], finest)
+    surprise.know(largest[~alone], finest)
     shown = (~largest.isnan().any(-1) & surprise.known).sum(-1)
     _, parts, _ = _largest(surprise, conversations, held_out.ranks)
     most = shown[~alone].sort(descending=True).values[FEWEST - 1]  # sensors that enough interactions have
