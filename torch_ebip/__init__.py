@@ -29,6 +29,8 @@ from torch_ebip.filtering import (
 )
 from torch_ebip.filtering.updates import *
 from torch_ebip.interaction import (
+    AnalogueReadout,
+    Analogues,
     Basis,
     BasisProjection,
     BSplineBasis,
@@ -84,6 +86,8 @@ from torch_ebip.recordings import Demonstrations, Layout, Modality
 
 __all__ = [
     "AboveOne",
+    "AnalogueReadout",
+    "Analogues",
     "BSplineBasis",
     "Basis",
     "BasisProjection",

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from torch_ebip.learning import Weights, remaining
-from torch_ebip.learning.drawing import CERTAIN, DOUBT, _trust, _widening
 from torch_ebip.learning.said import Said
+from torch_ebip.learning.shares import CERTAIN, DOUBT, trust, widening
 
 
 def said(rho: float, n: int = 40, heavy: bool = False) -> Said:
@@ -26,21 +26,21 @@ def said(rho: float, n: int = 40, heavy: bool = False) -> Said:
 def test_trust_grows_with_the_standard_errors_of_the_gain(rho: float) -> None:
     """Moments and sets of sensors of one interaction are one piece of evidence."""
     part, share = said(rho), 0.4
-    fold = part.interaction % 5
-    trust = _trust(part, torch.full((5, 1, 1), share, dtype=torch.float64), fold)
+    believed = trust(part.interaction, part.wanted, share * part.towards, part.place)
     wanted, towards = part.wanted.numpy(), part.towards.numpy()
     gain = wanted**2 - (wanted - share * towards) ** 2
     each = gain.reshape(40, -1).mean(-1)
     z = each.mean() / (each.std(ddof=1) / np.sqrt(40))
-    assert trust.item() == pytest.approx(np.clip((z - DOUBT) / (CERTAIN - DOUBT), 0, 1), abs=1e-6)
+    assert believed.item() == pytest.approx(np.clip((z - DOUBT) / (CERTAIN - DOUBT), 0, 1), abs=1e-6)
 
 
 def test_what_cannot_be_shown_is_not_trusted_and_what_can_is() -> None:
-    fold = said(0.0).interaction % 5
-    share = torch.full((5, 1, 1), 0.2, dtype=torch.float64)
-    assert [_trust(said(rho), share, fold).item() for rho in (0.0, 0.9)] == [0.0, 1.0]
-    half = _trust(said(0.3), share, fold).item()
-    assert 0 < half < 1
+    def found(rho: float) -> float:
+        part = said(rho)
+        return trust(part.interaction, part.wanted, 0.2 * part.towards, part.place).item()
+
+    assert [found(rho) for rho in (0.0, 0.9)] == [0.0, 1.0]
+    assert 0 < found(0.3) < 1
 
 
 @pytest.mark.parametrize("heavy", [False, True])
@@ -48,8 +48,8 @@ def test_deviations_are_stretched_until_they_hold_what_they_say(heavy: bool) -> 
     part = said(0.5, n=400, heavy=heavy)
     fold = part.interaction % 5
     share, width = torch.full_like(part.own, 0.3), torch.full_like(part.own, 0.5)
-    whole, left_out = _widening(part, share, width, fold)
     miss = (part.wanted - share * part.towards).abs()
+    whole, left_out = widening(miss / width, part.place, fold)
     assert float((miss <= 1.96 * whole.item() * width).double().mean()) == pytest.approx(0.95, abs=0.002)
     stretched = left_out[:, 0].view(-1, 1, 1, 1) * width
     assert float((miss <= 1.96 * stretched).double().mean()) == pytest.approx(0.95, abs=0.01)

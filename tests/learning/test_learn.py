@@ -34,6 +34,7 @@ from torch_ebip.learning.horizons import AHEAD
 from torch_ebip.learning.objective import ForecastObjective
 from torch_ebip.learning.references import nearest
 from torch_ebip.learning.remaining import remaining_error
+from torch_ebip.learning.said import what_it_says
 from torch_ebip.learning.stages import reference_scores, score
 from torch_ebip.learning.starts import FACTORS, best_factor, best_start, scaled, tunable
 from torch_ebip.recordings import actions, example
@@ -62,7 +63,8 @@ def test_it_is_the_recipe_step_by_step(shrink: bool) -> None:
     filter = tunable(primitive, start)
     order = torch.cat([held_out.partition.validating, held_out.partition.training])
     if shrink:
-        filter.readout = learn_drawing(held_out, filter, order, held_out.partition.validating).readout
+        said = what_it_says(held_out, filter, order)
+        filter.readout = learn_drawing(held_out, said, held_out.partition.validating).readout
     result = Tuner(filter, known, *task, settings).run()
     assert score(held_out, filter, held_out.partition.validating)["loss"] == pytest.approx(
         min(result.validation.values()), rel=1e-6
@@ -154,7 +156,8 @@ def test_shrinkage_finds_what_sensors_do_not_tell() -> None:
         task = Task(primitive, objective, targets, {sensor: layout.mask([sensor])})
         held_out = HeldOut(known, task, TuningSettings(thinning=2))
         filter = ebip(primitive, square_root=True, residual_variance=primitive.residual_variance)
-        drawn = learn_drawing(held_out, filter, some, some)
+        with torch.no_grad():
+            drawn = learn_drawing(held_out, what_it_says(held_out, filter, some), some)
         mean, _ = reference_scores(held_out, some)
         before = score(held_out, filter, some)["error"]
         assert drawn.scores["error"] <= 1.02 * before  # shares of each fold are learned on the others

@@ -2,6 +2,8 @@
 
 from torch_ebip.common.exports import exported
 from torch_ebip.interaction import phases
+from torch_ebip.interaction.analogue_readout import AnalogueReadout
+from torch_ebip.interaction.analogues import Analogues
 from torch_ebip.interaction.basis import (
     Basis,
     BSplineBasis,
@@ -42,6 +44,8 @@ from torch_ebip.interaction.table import DemonstrationTable
 from torch_ebip.interaction.trace import InteractionTrace
 
 __all__ = [
+    "AnalogueReadout",
+    "Analogues",
     "BSplineBasis",
     "Basis",
     "BasisProjection",

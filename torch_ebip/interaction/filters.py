@@ -10,14 +10,17 @@ from torch import Tensor
 
 from torch_ebip.common.ambient import eager
 from torch_ebip.common.draws import Generators
+from torch_ebip.filtering import functional
 from torch_ebip.filtering.base import EngineName, Filter
 from torch_ebip.filtering.protocols import MayLeaveSpan, View
 from torch_ebip.filtering.states import Memory, State
+from torch_ebip.interaction.analogue_readout import AnalogueReadout
 from torch_ebip.interaction.attribution import affine_coefficients
 from torch_ebip.interaction.bounds import Bounds
 from torch_ebip.interaction.doubt import Doubt
 from torch_ebip.interaction.forecast import Forecast, Phases, as_phases, as_seconds_ahead
 from torch_ebip.interaction.phases.phase import PhaseModel
+from torch_ebip.interaction.present import Present, prior_of
 from torch_ebip.interaction.projection import BasisProjection
 from torch_ebip.interaction.readout import Lead, Readout, lead_of
 from torch_ebip.interaction.recognition import Recognition
@@ -127,7 +130,8 @@ class InteractionFilter(Filter):
         lead = self.lead(state, forecast.phase, seconds)
         mean, variance = self.demonstrated(lead.phase)
         if self.readout is not None:
-            forecast = self.readout(forecast, lead, mean, variance)
+            present = self.present(state) if self.readout.reads_present else None
+            forecast = self.readout(forecast, lead, mean, variance, present)
         if self.doubt is not None:
             forecast = self.doubt(forecast, lead, mean, variance, self.doubted(state))
         return forecast if self.bounds is None else self.bounds(forecast, variance)
@@ -157,6 +161,26 @@ class InteractionFilter(Filter):
         _, _, mean, blocks = self._spread
         path, variance = basis.project_moments(phase, mean, blocks)
         return path, variance.clamp(min=0)
+
+    @eager
+    def present(self, state: State) -> Present:
+        """What a state of members says of the present, for a read-out that compares it with demonstrations.
+
+        Args:
+            state: of this filter, from `initial_state` on: it must know as which demonstrations its members started.
+
+        Raises:
+            ValueError: a state without members, made by hand, or of an update that has no `Recent`.
+        """
+        memory, recent = getattr(state, "memory", None), getattr(getattr(self, "analysis", None), "recent", None)
+        if memory is None or recent is None or memory.recent is None:
+            raise ValueError("nobody remembers what was seen of late: the filter's update has no `Recent`")
+        moving, weights = self.model.split(state[0])[0], state.weights
+        phase = moving[..., :1]
+        mean = functional.ensemble_mean(phase, weights).squeeze(-1)
+        variance = functional.ensemble_variance(phase, weights).squeeze(-1)
+        count = len(self.prior.states)  # type: ignore[arg-type]
+        return Present(mean, variance, prior_of(memory, count), recent.line(memory.recent))
 
     def doubted(self, state: State) -> Tensor:
         """[...], how surprising the interaction of a ``state`` is of late, see `InteractionSurprise.doubt`."""
@@ -211,7 +235,8 @@ class InteractionFilter(Filter):
         """Which demonstrations speak: the mean forecast is this affine combination of their trajectories.
 
         Each forecast's mean is sum_i c_i h(phase, w_i), because nothing ever leaves the span of the
-        demonstrations. See `torch_ebip.interaction.attribution`.
+        demonstrations. See `torch_ebip.interaction.attribution`. With an `AnalogueReadout` it is what its analogues
+        count, which is one of its two voices.
 
         Args:
             state: of this filter.
@@ -222,6 +247,9 @@ class InteractionFilter(Filter):
         Raises:
             ValueError: an option moves weights out of the span; says which.
         """
+        if isinstance(self.readout, AnalogueReadout):
+            speaking: Tensor = self.readout.analogues(self.present(state)).weights
+            return speaking
         reason = self._leaves_span()
         if reason is not None:
             raise ValueError(f"forecasts are no combination of the demonstrations: {reason}")

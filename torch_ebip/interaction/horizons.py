@@ -22,6 +22,7 @@ from torch_ebip.common.ambient import owned
 from torch_ebip.common.arguments import as_values
 from torch_ebip.filtering.protocols import View
 from torch_ebip.interaction.forecast import Forecast
+from torch_ebip.interaction.present import Present
 from torch_ebip.interaction.readout import Lead, Widths, hats, moved, widths_of
 
 SECONDS = (0.1, 0.25, 0.5, 1.0, math.inf)
@@ -57,6 +58,7 @@ class HorizonShrinkage(nn.Module):
         [[1.0]]
     """
 
+    reads_present = False
     share: Tensor
     widening: Tensor
     seconds: Tensor
@@ -85,7 +87,9 @@ class HorizonShrinkage(nn.Module):
         self.register_buffer("seconds", owned(places["seconds"]))
         self.register_buffer("levels", owned(places["levels"]))
 
-    def forward(self, forecast: Forecast, lead: Lead, mean: Tensor, variance: Tensor) -> Forecast:
+    def forward(
+        self, forecast: Forecast, lead: Lead, mean: Tensor, variance: Tensor, present: Present | None = None
+    ) -> Forecast:
         """Draw a forecast towards the demonstrations.
 
         Args:
@@ -93,6 +97,7 @@ class HorizonShrinkage(nn.Module):
             lead: of it, how far ahead it is.
             mean: [..., P, D], of the demonstrations at the phases of the forecast, units of the DoFs.
             variance: [..., P, D], of the demonstrations there, squared units.
+            present: not looked at.
         """
         widths = widths_of(forecast, variance)
         at = horizon_hats(lead, self.seconds)  # [..., P, K]

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch_ebip.common.brief import brief
 from torch_ebip.filtering.protocols import View
 from torch_ebip.interaction.forecast import Forecast
+from torch_ebip.interaction.present import Present
 
 NEAR = 0.95
 """Phase from which a path that is asked for by its phases becomes its end."""
@@ -23,12 +24,14 @@ class Lead(NamedTuple):
         seconds: [..., P], s.
         phase: [..., P], of what is forecast.
         end: [..., P], 0 to 1: how far it is the interaction's end that is asked for, whenever that may be.
+        asked: [P], the seconds that were asked for, infinity the end; None where phases were.
     """
 
     ahead: Tensor
     seconds: Tensor
     phase: Tensor
     end: Tensor
+    asked: Tensor | None = None
 
     def __repr__(self) -> str:
         return brief(self)
@@ -52,8 +55,14 @@ class Widths(NamedTuple):
 class Readout(Protocol):
     """What forecasts pass through."""
 
-    def __call__(self, forecast: Forecast, lead: Lead, mean: Tensor, variance: Tensor) -> Forecast:
-        """The forecast [..., P, D] that far ahead, where the demonstrations have this mean and variance."""
+    reads_present: bool
+    """Whether it asks for the present; otherwise it is told None."""
+
+    def __call__(
+        self, forecast: Forecast, lead: Lead, mean: Tensor, variance: Tensor, present: Present | None = None
+    ) -> Forecast:
+        """The forecast [..., P, D] that far ahead of the ``present``, where the demonstrations have this mean and
+        variance."""
 
     def select(self, view: View) -> Readout:
         """The same for a view of the model."""
@@ -74,7 +83,7 @@ def lead_of(phase: Tensor, velocity: Tensor, of: Tensor, asked: Tensor | None = 
     ahead = (of - phase.clamp(0, 1).unsqueeze(-1)).clamp(min=0)
     going = velocity > 0
     seconds = torch.where(going, ahead / torch.where(going, velocity, 1), torch.inf)
-    return Lead(ahead, torch.where(ahead > 0, seconds, 0), of, end.clamp(0, 1))
+    return Lead(ahead, torch.where(ahead > 0, seconds, 0), of, end.clamp(0, 1), asked)
 
 
 def hats(lead: Tensor, leads: Tensor) -> Tensor:
@@ -91,10 +100,14 @@ def hats(lead: Tensor, leads: Tensor) -> Tensor:
 def widths_of(forecast: Forecast, variance: Tensor) -> Widths:
     """Deviations of a forecast and of the demonstrations, whose ``variance`` is [..., P, D] in squared units."""
     least = torch.finfo(variance.dtype).tiny
+    return Widths(forecast.variance.clamp(min=least).sqrt(), root(variance))
+
+
+def root(variance: Tensor) -> Tensor:
+    """Deviations [...] of variances [...], 0 of what is not above 0."""
     # The root of 0 has no gradient, and one that is infinite would make those of all parameters NaN.
     apart = variance > 0
-    demonstrated = torch.where(apart, torch.where(apart, variance, 1).sqrt(), 0)
-    return Widths(forecast.variance.clamp(min=least).sqrt(), demonstrated)
+    return torch.where(apart, torch.where(apart, variance, 1).sqrt(), 0)
 
 
 def moved(forecast: Forecast, mean: Tensor, deviation: Tensor, share: Tensor, widths: Widths) -> Forecast:

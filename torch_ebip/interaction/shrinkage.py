@@ -17,6 +17,7 @@ from torch_ebip.common.ambient import owned
 from torch_ebip.common.arguments import as_values
 from torch_ebip.filtering.protocols import View
 from torch_ebip.interaction.forecast import Forecast
+from torch_ebip.interaction.present import Present
 from torch_ebip.interaction.readout import Lead, moved, widths_of
 
 LEADS = (0.0, 0.125, 0.25, 0.5, 1.0)
@@ -48,6 +49,7 @@ class Shrinkage(nn.Module):
         [[1.0]]
     """
 
+    reads_present = False
     share: Tensor
     leads: Tensor
 
@@ -70,7 +72,9 @@ class Shrinkage(nn.Module):
         part = ((lead - start) / (leads[right] - start)).clamp(0, 1).unsqueeze(-1)
         return torch.lerp(share[left], share[right], part)
 
-    def forward(self, forecast: Forecast, lead: Lead, mean: Tensor, variance: Tensor) -> Forecast:
+    def forward(
+        self, forecast: Forecast, lead: Lead, mean: Tensor, variance: Tensor, present: Present | None = None
+    ) -> Forecast:
         """Draw a forecast towards the demonstrations.
 
         Args:
@@ -78,6 +82,7 @@ class Shrinkage(nn.Module):
             lead: of it, how far ahead it is.
             mean: [..., P, D], of the demonstrations at the phases of the forecast, units of the DoFs.
             variance: [..., P, D], of the demonstrations there, squared units.
+            present: not looked at.
         """
         share = self.at(lead.ahead)
         drawn = mean + share * (forecast.mean - mean)

@@ -20,6 +20,8 @@ from torch_ebip.filtering.updates.inflation import Inflation
 from torch_ebip.filtering.updates.rules import SquareRoot
 from torch_ebip.filtering.updates.student_t import StudentT
 from torch_ebip.filtering.updates.trust import RobustWeights
+from torch_ebip.interaction.analogue_readout import VOICES, AnalogueReadout
+from torch_ebip.interaction.analogues import Analogues
 from torch_ebip.interaction.basis.base import Basis
 from torch_ebip.interaction.basis.bspline import BSplineBasis
 from torch_ebip.interaction.basis.gaussian import GaussianBasis
@@ -35,6 +37,7 @@ from torch_ebip.interaction.noise import InteractionNoise
 from torch_ebip.interaction.phases.constant_velocity import ConstantVelocityPhase
 from torch_ebip.interaction.phases.drifting import DriftingPhase
 from torch_ebip.interaction.phases.phase import PhaseModel
+from torch_ebip.interaction.present import recent_of
 from torch_ebip.interaction.presets import ebip
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.interaction.readout import Readout
@@ -139,6 +142,7 @@ def describe_filter(filter: InteractionFilter, primitive: InteractionPrimitive) 
         "inflation": "learned" if learned else float(inflation.factor) if isinstance(inflation, Inflation) else None,  # type: ignore[arg-type]
         "phase": _describe_phase(filter.phase_model),
         "readout": _describe_readout(filter.readout),
+        "recent": None if update.recent is None else update.recent.window,
         "recognition": filter.recognition is not None and len(filter.recognition.sharpness) > 0,
         **describe_caution(filter),
     }
@@ -182,6 +186,8 @@ def build_filter(primitive: InteractionPrimitive, description: Description) -> I
             ones = primitive.weights.new_ones(len(weighting.forgetting.start), len(PHASES))
             filter.recognition = Recognition(primitive.labels, ones).to(primitive.weights)
         filter.readout = None if readout is None else _readout_of(readout, primitive)
+        if description.get("recent") is not None:  # older files know of none
+            filter.analysis.recent = recent_of(primitive, float(description["recent"]))
         give_caution(filter, primitive, description)
         return filter
     except (AttributeError, ArithmeticError, LookupError, TypeError, ValueError) as error:
@@ -242,8 +248,10 @@ def _describe_phase(phase: PhaseModel) -> Description:
 def _describe_readout(readout: Readout | None) -> Any:
     if readout is None:
         return None
-    if isinstance(readout, HorizonShrinkage):
+    if isinstance(readout, HorizonShrinkage | AnalogueReadout):
         seconds = [s if math.isfinite(s) else "end" for s in readout.seconds.tolist()]
+        if isinstance(readout, AnalogueReadout):
+            return {"seconds": seconds, "compared": readout.analogues.dofs.tolist()}
         return {"seconds": seconds, "levels": readout.levels.tolist()}
     if isinstance(readout, Shrinkage):
         return readout.leads.tolist()
@@ -256,6 +264,12 @@ def _readout_of(description: Any, primitive: InteractionPrimitive) -> Readout:
     if isinstance(description, list):  # of older files
         return Shrinkage(ones(D, len(description)), description)
     seconds = [math.inf if s == "end" else float(s) for s in description["seconds"]]
+    if "compared" in description:
+        compared = torch.zeros(D, dtype=torch.bool, device="cpu")
+        compared[description["compared"]] = True
+        analogues = Analogues.of(primitive, compared)
+        square = ones(len(seconds), D, D)
+        return AnalogueReadout(analogues, square, square, ones(len(seconds), D, len(VOICES)), seconds)
     levels = description["levels"]
     return HorizonShrinkage(ones(D, len(seconds), len(levels)), ones(D, len(seconds)), seconds, levels)
 

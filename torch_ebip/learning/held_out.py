@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -16,6 +17,7 @@ from torch import Tensor
 from torch_ebip.common.ambient import without_autocast
 from torch_ebip.common.brief import brief
 from torch_ebip.common.draws import seeded
+from torch_ebip.filtering.states import EnsembleState
 from torch_ebip.filtering.trace import Trace
 from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.forecast import Forecast
@@ -23,6 +25,7 @@ from torch_ebip.learning.configuration import Task
 from torch_ebip.learning.objective import ForecastObjective
 from torch_ebip.learning.partition import Partition, generator_of
 from torch_ebip.learning.ranks import Ranks
+from torch_ebip.learning.recently import recent_sums
 from torch_ebip.learning.references import last_measured, recorded
 from torch_ebip.learning.settings import TuningSettings
 from torch_ebip.recordings.demonstrations import Demonstrations
@@ -87,8 +90,13 @@ class Trial(NamedTuple):
 
     def forecast(self, objective: ForecastObjective) -> Forecast:
         """Of the targets where an objective asks for them, from the kept states: mean [B, K, P, D_targets]."""
-        said = objective.forecast(self.filter, self.trace.kept, self.shown.now)
-        return said.select(self.shown.targets)
+        targets, kept = self.shown.targets, self.trace.kept
+        if isinstance(kept, EnsembleState) and kept.centre is not None:
+            # What nobody asks for need not be forecast.
+            entries = self.filter.model.view(targets.cpu()).state
+            part = kept._replace(deviations=kept.deviations[..., entries], centre=kept.centre[..., entries])
+            return objective.forecast(self.filter.restrict(targets), part, self.shown.now)
+        return objective.forecast(self.filter, kept, self.shown.now).select(targets)
 
 
 class HeldOut:
@@ -170,7 +178,25 @@ class HeldOut:
             segment=segment or None,
             project=False,
         )
-        return Trial(shown, part, trace)
+        return Trial(shown, part, self._seen_lately(shown, part, trace))
+
+    def _seen_lately(self, shown: Shown, filter: InteractionFilter, trace: Trace) -> Trace:
+        """The trace, its states knowing what all samples showed of late, not only those that thinning left."""
+        recent, kept, stride = getattr(filter.analysis, "recent", None), trace.kept, self.settings.thinning
+        if recent is None or kept is None or stride == 1:
+            return trace
+        steps = shown.steps * stride
+        length = int(steps.max()) + 1
+        sensors = shown.observed.flatten(0, 1).any(0)
+        y = self.values[shown.interactions, :length][..., shown.dofs]
+        observed = self.observed[shown.interactions, :length][..., shown.dofs] & sensors
+        counts = None
+        if trace.counts is not None and filter.surprise is not None:
+            at = torch.arange(length, device=y.device) // stride
+            counts = trace.counts[:, at][..., filter.surprise.sensor_of_dof].to(y)
+        sums = recent_sums(recent, y, observed, steps, 1 / self.task.primitive.rate, counts)
+        memory = kept.memory._replace(recent=sums)
+        return replace(trace, kept=kept._replace(memory=memory))
 
     def truth(self, interactions: Tensor, phase: Tensor) -> Tensor:
         """[B, K, P, D_targets], of interactions int64 [B]: their regressions at phases [B, K, P]."""

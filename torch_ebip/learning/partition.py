@@ -38,6 +38,11 @@ class Partition:
         self.fold_of, self._others = part, torch.stack([group[:size] for group in groups])
         self._size = settings.n_members
 
+    @property
+    def order(self) -> Tensor:
+        """int64 [N], all demonstrations, those that decide when to stop first."""
+        return torch.cat([self.validating, self.training])
+
     def members(self, interactions: Tensor, generator: torch.Generator) -> Tensor:
         """Indices [B, E] of demonstrations outside the fold of each of some interactions, int64 [B]."""
         others, size = self._others[self.fold_of[interactions]], self._size

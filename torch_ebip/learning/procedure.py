@@ -19,7 +19,7 @@ from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.kinematics import RobotArm
 from torch_ebip.learning.caution import familiar, learn_caution
 from torch_ebip.learning.configuration import Task
-from torch_ebip.learning.drawing import Drawn, learn_drawing
+from torch_ebip.learning.drawing import Drawn
 from torch_ebip.learning.groups import labelled
 from torch_ebip.learning.held_out import HeldOut
 from torch_ebip.learning.horizons import horizon_name, reached
@@ -31,6 +31,7 @@ from torch_ebip.learning.partition import generator_of
 from torch_ebip.learning.place import enter, fingerprint
 from torch_ebip.learning.progress import Reporter
 from torch_ebip.learning.ranks import Ranks
+from torch_ebip.learning.reading_out import learn_readout
 from torch_ebip.learning.recognising import learn_recognition
 from torch_ebip.learning.remaining import remaining_error
 from torch_ebip.learning.report import STAGES, Report, described, verdict_of, versions
@@ -40,11 +41,11 @@ from torch_ebip.learning.starts import FACTORS, TRIES, Start, best_factor, best_
 from torch_ebip.learning.tuner import Tuner
 from torch_ebip.recordings.demonstrations import Demonstrations
 
-PROCEDURE = 3  # what another edition of this file began in a folder is not gone on with
+PROCEDURE = 4  # what another edition of this file began in a folder is not gone on with
 FEWEST = 10
 """Demonstrations below which there is no gradient: those kept for validation would say nothing."""
-MOST = 100
-"""Interactions that decide about shrinkage, at most."""
+MOST = 200
+"""Interactions that decide about a read-out, at most."""
 WEIGHING = ("start", "gradient")
 """Stages whose filters remember what they saw, which a model of labelled interactions must."""
 
@@ -61,6 +62,7 @@ class Procedure:
     scan: int
     steps: int
     shrink: bool
+    analogues: bool
     ahead: tuple[float, ...]
     memories: int
     chances: dict[str, float]
@@ -128,6 +130,7 @@ class Procedure:
             "arm": None if objective.arm is None else f"{objective.arm}; {objective.arm.arm.meant()}",
             "joints": objective.joints,
             "shrink": self.shrink,
+            "analogues": self.analogues,
             "ahead": [horizon_name(a) for a in self.ahead],
             "memories": self.memories,
             "chances": self.chances,
@@ -206,7 +209,7 @@ class Procedure:
         self.reporter.stage("gradient")
         filter = tunable(self.primitive, Start(**self.said["start"]), self.members)
         if self.shrink:  # What is minimised is what will be said.
-            filter.readout = self._drawing(filter).readout
+            filter.readout = learn_readout(self.held_out, filter, self._deciding, self.scored, False).drawn.readout
         last = 0
 
         def show(step: int, loss: float, validation: float) -> None:
@@ -228,22 +231,22 @@ class Procedure:
         self._stage("gradient", filter)
 
     def _draw(self, filter: InteractionEnsembleFilter) -> Drawn:
-        """How far the forecasts of a filter are drawn towards the mean, and how wide they are."""
-        self.reporter.stage("shrinkage")
-        drawn = self._drawing(filter)
+        """What the forecasts of a filter pass through: see `learn_readout`."""
+        self.reporter.stage("read-out")
+        found = learn_readout(self.held_out, filter, self._deciding, self.scored, self.shrink and self.analogues)
         if self.shrink:
-            filter.readout = drawn.readout
-            self.said["shrinkage"] = drawn.shares
-            self.scores["shrinkage"] = drawn.scores
+            self.said |= found.said
+            self.scores |= found.scores
+            self.remarks.extend(found.remarks)
+        else:
+            filter.readout = None
         self.reporter.tick()
-        return drawn
+        return found.drawn
 
-    def _drawing(self, filter: InteractionEnsembleFilter) -> Drawn:
-        """See `learn_drawing`."""
-        # Those that are scored first: they are the beginning of the order.
-        partition = self.held_out.partition
-        some = torch.cat([partition.validating, partition.training])[: max(MOST, len(self.scored))]
-        return learn_drawing(self.held_out, filter, some, self.scored)
+    @property
+    def _deciding(self) -> Tensor:
+        """int64 [B], the interactions that decide about a read-out."""
+        return self.held_out.partition.order[: max(MOST, len(self.scored))]
 
     def _recognise(self, filter: InteractionEnsembleFilter) -> None:
         """How sure the filter may be of a label."""

@@ -45,6 +45,7 @@ def learn(
     joints: str | None = None,
     basis: StackedBasis | None = None,
     shrink: bool = True,
+    analogues: bool = True,
     ahead: Sequence[float] = AHEAD,
     memories: int = 2,
     scan: int = 48,
@@ -78,6 +79,8 @@ def learn(
             DoFs have their names, or are as many.
         basis: default: `select_basis`.
         shrink: whether forecasts are drawn towards the training mean, see `HorizonShrinkage`.
+        analogues: whether they may be put together with those of analogues, where that is better; see
+            `AnalogueReadout`.
         ahead: horizons that count alike, in s, increasing; the last is infinity, the end.
         memories: of the evidence: 2, a fast and a slow one, or the fast one alone.
         scan: how many interactions decide where the gradient starts.
@@ -133,7 +136,19 @@ def learn(
     settings = settings_for(known, max(steps, 1), seed, members, tuning)
     ranks = Ranks() if ranks is None else ranks
     run = Procedure(
-        known, tuple(targets), shown, settings, members, scan, steps, shrink, ahead, memories, chances, ranks
+        known,
+        tuple(targets),
+        shown,
+        settings,
+        members,
+        scan,
+        steps,
+        shrink,
+        analogues,
+        ahead,
+        memories,
+        chances,
+        ranks,
     )
     run.prepare(arm, joints, basis)
     place = None if folder is None else Path(folder)

@@ -9,8 +9,10 @@ import torch
 from torch import Tensor
 
 from torch_ebip.common.brief import brief
+from torch_ebip.filtering.states import map_state
 from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.horizons import LEVELS, horizon_hats, level_hats
+from torch_ebip.interaction.present import Present
 from torch_ebip.interaction.readout import widths_of
 from torch_ebip.learning.held_out import HeldOut
 
@@ -27,6 +29,7 @@ class Said(NamedTuple):
         place: [R, K, P, S], see `horizon_hats`.
         mean: [R, K, P, D], of the demonstrations, units of the scale.
         doubt: [R, K], how surprised the filter was, see `InteractionSurprise.doubt`; 0 if it never is.
+        present: [R, K], what it knew of the present; None where it remembers nothing of late.
     """
 
     interaction: Tensor
@@ -38,20 +41,30 @@ class Said(NamedTuple):
     place: Tensor
     mean: Tensor
     doubt: Tensor
+    present: Present | None = None
 
     def __repr__(self) -> str:
         return brief(self)
 
 
-def what_it_says(held_out: HeldOut, filter: InteractionFilter, interactions: Tensor) -> Said:
-    """What a filter says of interactions int64 [B], with every set of sensors; of all processes together."""
+def what_it_says(
+    held_out: HeldOut, filter: InteractionFilter, interactions: Tensor, shares: Tensor | None = None
+) -> Said:
+    """What a filter says of interactions, with every set of sensors; of all processes together.
+
+    Args:
+        held_out: the demonstrations, and what is asked of them.
+        filter: over all DoFs.
+        interactions: int64 [B].
+        shares: [K], up to which parts of their length they are shown; default: see `HeldOut.shares`.
+    """
     task = held_out.task
     primitive, targets, objective = task.primitive, task.targets, task.objective
     scale, ahead = objective.scale, objective.ahead
     seconds = scale.new_tensor([math.inf]) if ahead is None else ahead
     parts: list[Said] = []
     for subset in task.subsets.values():
-        for trial in held_out.trials(filter, interactions, subset):
+        for trial in held_out.trials(filter, interactions, subset, shares):
             shown, state = trial.shown, trial.trace.kept
             forecast = trial.forecast(objective)
             lead = trial.filter.lead(state, forecast.phase, ahead)
@@ -74,9 +87,11 @@ def what_it_says(held_out: HeldOut, filter: InteractionFilter, interactions: Ten
                     place,
                     mean / scale,
                     trial.filter.doubted(state),
+                    None if getattr(filter.analysis, "recent", None) is None else trial.filter.present(state),
                 )
             )
-    shares = held_out.ranks.gather([[tensor.cpu() for tensor in part] for part in parts])
-    together = [part for share in shares for part in share]
+    gathered = held_out.ranks.gather([map_state(Tensor.cpu, part) for part in parts])
+    together = [part for share in gathered for part in share]
     device = primitive.weights.device
-    return Said(*(torch.cat(tensors).to(device) for tensors in zip(*together, strict=True)))
+    found: Said = map_state(lambda *tensors: torch.cat(tensors).to(device), *together)
+    return found

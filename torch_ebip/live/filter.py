@@ -22,6 +22,7 @@ from torch_ebip.filtering.carriers.checks import measured_dofs
 from torch_ebip.filtering.carriers.plan import kept
 from torch_ebip.filtering.carriers.span import SpanCarrier
 from torch_ebip.filtering.states import EnsembleState, Memory
+from torch_ebip.interaction.analogue_readout import AnalogueReadout
 from torch_ebip.interaction.filter_kinds import InteractionEnsembleFilter
 from torch_ebip.interaction.forecast import Forecast, Phases
 
@@ -100,7 +101,9 @@ class LiveFilter:
         self.filter, self.generator, self.batch_shape = filter, generator, batch_shape
         self.carrier = SpanCarrier(filter.model, filter.analysis, dofs, state, generator)
         self._like, self._dt, self._n_dofs = self.carrier.matrix, filter.dt, filter.n_dofs
-        self._forecasters: OrderedDict[tuple[bool, ...], tuple[InteractionEnsembleFilter, Tensor]] = OrderedDict()
+        self._forecasters: OrderedDict[tuple[bool, ...], tuple[InteractionEnsembleFilter, Tensor, Tensor | None]] = (
+            OrderedDict()
+        )
 
     @property
     @in_own_modes
@@ -165,8 +168,9 @@ class LiveFilter:
         """
         D = self.filter.n_dofs
         chosen = (True,) * D if dofs is None else tuple(as_mask("dofs", dofs, D).tolist())
-        part, columns = kept(self._forecasters, chosen, self._make_forecaster)
-        return part.forecast(self.carrier.state(columns), phase, ahead=ahead)
+        part, columns, asked = kept(self._forecasters, chosen, self._make_forecaster)
+        forecast = part.forecast(self.carrier.state(columns), phase, ahead=ahead)
+        return forecast if asked is None else forecast.select(asked)
 
     @in_own_modes
     @torch.no_grad()
@@ -242,11 +246,16 @@ class LiveFilter:
         """
         return self.carrier.take(y, measured, mask)
 
-    def _make_forecaster(self, chosen: tuple[bool, ...]) -> tuple[InteractionEnsembleFilter, Tensor]:
-        view = self.filter.model.view(torch.tensor(chosen, device="cpu"))
+    def _make_forecaster(self, chosen: tuple[bool, ...]) -> tuple[InteractionEnsembleFilter, Tensor, Tensor | None]:
+        """A filter of the DoFs that must be forecast, which weights it needs, and which DoFs were asked for of it."""
+        asked = dofs = torch.tensor(chosen, device="cpu")
+        readout = self.filter.readout
+        if isinstance(readout, AnalogueReadout):
+            dofs = readout.together(dofs)
         m = self.filter.phase_model.moving
-        dofs = torch.tensor(chosen, device="cpu")
-        return (self.filter if all(chosen) else self.filter.restrict(dofs)), view.state[m:] - m
+        columns = self.filter.model.view(dofs).state[m:] - m
+        part = self.filter if bool(dofs.all()) else self.filter.restrict(dofs)
+        return part, columns, None if torch.equal(asked, dofs) else asked[dofs]
 
     def __repr__(self) -> str:
         return f"LiveFilter({type(self.filter).__name__}, E={self._like.shape[-1]}, batch {list(self.batch_shape)})"

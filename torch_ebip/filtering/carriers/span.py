@@ -147,7 +147,8 @@ class SpanCarrier(Carrier):
         self._advance(dt)
         self._drawn(self._draws)
         self._add_product(self._moving, self._step_factor[1], self._draws_by_entry)
-        if self.memory.weighting is not None or self.memory.surprise is not None:
+        memory = self.memory
+        if memory.weighting is not None or memory.surprise is not None or memory.recent is not None:
             self.memory = self._update.forget(self.memory, self._step_factor[2])
 
     def take(self, y: Tensor, measured: tuple[bool, ...], mask: Tensor | None) -> Tensor:

@@ -10,6 +10,7 @@ from torch_ebip.filtering.updates.inflation import Inflation as Inflation
 from torch_ebip.filtering.updates.inflation import SpreadRule as SpreadRule
 from torch_ebip.filtering.updates.localisation import Localisation as Localisation
 from torch_ebip.filtering.updates.part import Part as Part
+from torch_ebip.filtering.updates.recent import Recent as Recent
 from torch_ebip.filtering.updates.relaxation import RelaxationToPrior as RelaxationToPrior
 from torch_ebip.filtering.updates.rules import Rule as Rule
 from torch_ebip.filtering.updates.rules import SquareRoot as SquareRoot

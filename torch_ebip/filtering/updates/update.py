@@ -15,6 +15,7 @@ from torch_ebip.filtering.states import Memory
 from torch_ebip.filtering.updates.inflation import SpreadRule
 from torch_ebip.filtering.updates.localisation import Localisation
 from torch_ebip.filtering.updates.part import Part
+from torch_ebip.filtering.updates.recent import Recent
 from torch_ebip.filtering.updates.rules import Rule, Stochastic
 from torch_ebip.filtering.updates.surprise import Noticed, Surprise, believed
 from torch_ebip.filtering.updates.trust import RobustWeights
@@ -36,6 +37,7 @@ class Slots(NamedTuple):
     weighting: Weighting | None
     localisation: Localisation | None
     inflation: SpreadRule | None
+    recent: Recent | None = None
 
 
 class Update(nn.Module):
@@ -48,6 +50,7 @@ class Update(nn.Module):
         weighting: weighs members by what was seen.
         localisation: factors on the cross-covariances of blocks of the state.
         inflation: what becomes of the anomalies: `Inflation`.
+        recent: remembers what was seen of late, for forecasts that compare it: `Recent`.
 
     Example:
         >>> from torch_ebip import Inflation, SquareRoot, StudentT, Update
@@ -59,6 +62,7 @@ class Update(nn.Module):
     weighting: Weighting | None
     localisation: Localisation | None
     inflation: SpreadRule | None
+    recent: Recent | None
 
     def __init__(
         self,
@@ -68,6 +72,7 @@ class Update(nn.Module):
         localisation: Localisation | None = None,
         inflation: SpreadRule | None = None,
         surprise: Surprise | None = None,
+        recent: Recent | None = None,
     ) -> None:
         super().__init__()
         self.rule = Stochastic() if rule is None else rule
@@ -76,12 +81,21 @@ class Update(nn.Module):
         self.weighting = weighting
         self.localisation = localisation
         self.inflation = inflation
+        self.recent = recent
 
     @property
     def parts(self) -> list[Part]:
         """All that there are, in their order."""
-        slots = (self.rule, self.surprise, *self.trust, self.weighting, self.localisation, self.inflation)
-        return [part for part in slots if isinstance(part, Part)]
+        parts = (
+            self.rule,
+            self.surprise,
+            *self.trust,
+            self.weighting,
+            self.localisation,
+            self.inflation,
+            self.recent,
+        )
+        return [part for part in parts if isinstance(part, Part)]
 
     @property
     def leaves_span(self) -> str | None:
@@ -97,7 +111,9 @@ class Update(nn.Module):
         """
         weighting = None if self.weighting is None or origin is None else self.weighting.start(origin)
         inflation = None if self.inflation is None else self.inflation.start(members)
-        return Memory(weighting, inflation, origin, None if self.surprise is None else self.surprise.start(members))
+        surprise = None if self.surprise is None else self.surprise.start(members)
+        recent = None if self.recent is None else self.recent.start(members)
+        return Memory(weighting, inflation, origin, surprise, recent)
 
     def complete(self, memory: Memory, members: Tensor) -> Memory:
         """The memory of a state made by hand, with members [..., E, n], as if it had seen nothing."""
@@ -105,23 +121,27 @@ class Update(nn.Module):
             memory = memory._replace(inflation=self.inflation.start(members))
         if self.surprise is not None and memory.surprise is None:
             memory = memory._replace(surprise=self.surprise.start(members))
+        if self.recent is not None and memory.recent is None:
+            memory = memory._replace(recent=self.recent.start(members))
         return memory
 
     def forget(self, memory: Memory, dt: Tensor) -> Memory:
         """What is left of a memory after dt [...] seconds."""
-        weighting, surprise = memory.weighting, memory.surprise
+        weighting, surprise, recent = memory.weighting, memory.surprise, memory.recent
         if self.weighting is not None and weighting is not None:
             weighting = self.weighting.forget(weighting, dt)
         if self.surprise is not None and surprise is not None:
             surprise = self.surprise.forget(surprise, dt)
-        return memory._replace(weighting=weighting, surprise=surprise)
+        if self.recent is not None and recent is not None:
+            recent = self.recent.forget(recent, dt)
+        return memory._replace(weighting=weighting, surprise=surprise, recent=recent)
 
     def select(self, view: View) -> Update:
         """The update of a view of the model: every part narrows itself."""
         part = sharing(self)
         part.rule = self.rule.select(view)
         part.trust = nn.ModuleList([trust.select(view) for trust in self.trust])  # type: ignore[operator]
-        for name in ("surprise", "weighting", "localisation", "inflation"):
+        for name in ("surprise", "weighting", "localisation", "inflation", "recent"):
             slot = getattr(self, name)
             setattr(part, name, None if slot is None else slot.select(view))
         return part
@@ -129,7 +149,8 @@ class Update(nn.Module):
     @property
     def slots(self) -> Slots:
         """The parts by their places."""
-        return Slots(self.rule, self.surprise, tuple(self.trust), self.weighting, self.localisation, self.inflation)  # type: ignore
+        trust: tuple[RobustWeights, ...] = tuple(self.trust)  # type: ignore[arg-type]
+        return Slots(self.rule, self.surprise, trust, self.weighting, self.localisation, self.inflation, self.recent)
 
 
 def analyse(slots: Slots, carrier: Carrier, measured: Measured, perturbations: Tensor | None) -> Tensor:
@@ -144,27 +165,28 @@ def analyse(slots: Slots, carrier: Carrier, measured: Measured, perturbations: T
     Returns:
         The log-likelihood [...] of what was measured.
     """
-    rule, surprise, trust, weighting, localisation, inflation = slots
+    rule, surprise, trust, weighting, localisation, inflation, recent = slots
     memory, counts, spread, taper = carrier.memory, None, NO_SPREAD, None
     observed = measured.observed
-    weights, grown, felt = memory.weighting, memory.inflation, memory.surprise
+    weights, grown, felt, lately = memory.weighting, memory.inflation, memory.surprise, memory.recent
     if surprise is not None or trust:
         noticed = _noticed(carrier, measured)
         if surprise is not None:
             felt, counts = surprise.judge(felt, noticed)
             observed = _not_rejected(observed, counts)
         measured, counts = _trusted(surprise, trust, noticed, measured, counts)
-    if weighting is not None and weights is not None:
-        assert memory.origin is not None
+    if weights is not None or lately is not None:
         seen = Seen(measured.y, observed, counts, measured.rows, carrier.moving, carrier.mean, memory.origin)
-        weights = weighting.learn(weights, seen)
+        weights = weights if weighting is None or weights is None else weighting.learn(weights, seen)
+        lately = lately if recent is None or lately is None else recent.learn(lately, seen)
     if inflation is not None:
         spread, grown = inflation(grown, _share(measured, counts))
     if localisation is not None:
         taper = localisation()
     likelihood = carrier.move(rule, measured, taper, spread, perturbations)
-    if weights is not memory.weighting or grown is not memory.inflation or felt is not memory.surprise:
-        carrier.memory = Memory(weights, grown, memory.origin, felt)
+    now = Memory(weights, grown, memory.origin, felt, lately)
+    if any(after is not before for after, before in zip(now, memory, strict=True)):
+        carrier.memory = now
     return likelihood
 
 

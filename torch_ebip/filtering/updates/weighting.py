@@ -29,7 +29,8 @@ class Seen(NamedTuple):
         rows: int64 [K], which of the filter's DoFs these are; None for all.
         moving: [..., E, m], what moves of each member.
         mean: [..., m], its mean.
-        origin: int64 [..., E], as which of the prior's states each member started.
+        origin: int64 [..., E], as which of the prior's states each member started; None where the prior does not
+            know.
     """
 
     y: Tensor
@@ -38,7 +39,7 @@ class Seen(NamedTuple):
     rows: Tensor | None
     moving: Tensor
     mean: Tensor
-    origin: Tensor
+    origin: Tensor | None
 
     def __repr__(self) -> str:
         return brief(self)

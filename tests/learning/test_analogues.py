@@ -1,0 +1,168 @@
+"""Analogues that are learned: of interactions whose future bends, through the model's file, and of few."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.conftest import interactions
+from torch_ebip import Demonstrations, Layout, Modality, learn
+from torch_ebip.interaction import AnalogueReadout
+from torch_ebip.learning import InteractionModel
+from torch_ebip.learning.recently import recent_sums
+from torch_ebip.learning.stacking import best_correction, best_width
+
+QUICK = {"steps": 0, "scan": 6}
+
+
+def bending(count: int, seed: int = 0) -> Demonstrations:
+    """A hand that turns off to one side; the arm goes to the square of where: no line through the demonstrations."""
+    draws = torch.Generator().manual_seed(seed)
+    layout = Layout([Modality("hand", ["x", "y"], "m"), Modality("arm", ["a"], "rad", controlled=True)])
+    paths = []
+    for _ in range(count):
+        length = int(torch.randint(36, 45, (), generator=draws))
+        phase = torch.linspace(0, 1, length).unsqueeze(-1)
+        goal = 2 * torch.rand((), generator=draws) - 1
+        path = torch.cat([goal * phase.square(), phase, phase * (goal.square() - 0.33)], -1)
+        paths.append(path + 0.005 * torch.randn(path.shape, generator=draws))
+    return Demonstrations(layout, paths, 30.0)
+
+
+@pytest.fixture(scope="module")
+def bent() -> InteractionModel:
+    return learn(bending(60), **QUICK)
+
+
+def error(model: InteractionModel, tests: Demonstrations, share: float = 0.7) -> float:
+    """Root mean squared error of the end, after a share of each."""
+    misses = []
+    for trajectory in tests:
+        said = model.forecast(trajectory[: round(share * len(trajectory))], [math.inf])
+        misses.append(float(said.mean[-1, 0, -1] - trajectory[-1, -1]))
+    return float(np.sqrt(np.mean(np.square(misses))))
+
+
+def test_they_bend_where_the_filter_cannot(bent: InteractionModel) -> None:
+    """Strangers to both, and what is said of the models' worth is true."""
+    straight = learn(bending(60), analogues=False, **QUICK)
+    tests = bending(40, seed=1)
+    assert isinstance(bent.filter.readout, AnalogueReadout)
+    told = bent.report["analogues"]
+    assert told["used"]
+    assert told["crps"] < told["crps_without"]
+    assert bent.report["stages"]["analogues"]["error/end"] < 0.9 * bent.report["stages"]["shrinkage"]["error/end"]
+    assert error(bent, tests) < 0.9 * error(straight, tests)
+    assert straight.filter.analysis.recent is None
+    assert "analogues" not in straight.report
+
+
+def test_deviations_hold_what_they_say(bent: InteractionModel) -> None:
+    inside = []
+    for trajectory in bending(60, seed=2):
+        said = bent.forecast(trajectory, [0.25, math.inf])
+        at = round(0.5 * len(trajectory))
+        truth = torch.stack([trajectory[at + round(0.25 * 30), -1], trajectory[-1, -1]])
+        inside.append(((said.mean[at, :, -1] - truth).abs() <= 1.96 * said.variance[at, :, -1].sqrt()).double())
+    assert 0.87 <= float(torch.stack(inside).mean()) <= 1.0
+
+
+def test_they_are_kept_in_the_file_and_say_the_same(bent: InteractionModel, tmp_path: Path) -> None:
+    bent.save(tmp_path / "model.safetensors")
+    again = InteractionModel.load(tmp_path / "model.safetensors")
+    y = bending(1, seed=3)[0]
+    for ours, theirs in zip(
+        bent.forecast(y, [0.1, math.inf])[:2], again.forecast(y, [0.1, math.inf])[:2], strict=True
+    ):
+        torch.testing.assert_close(ours, theirs)
+    session = again.session()
+    for i, row in enumerate(y[:20]):
+        session.push("hand", row[:2].tolist(), i / 30)
+    assert session.forecast().mean.isfinite().all()
+
+
+def test_a_model_that_grows_compares_with_the_new_ones_too(bent: InteractionModel) -> None:
+    more = bent.extend(bending(10, seed=4))
+    assert len(more.filter.readout.analogues.pace) == 70
+    for ours, theirs in zip(bent.filter.readout.parameters(), more.filter.readout.parameters(), strict=True):
+        assert torch.equal(ours, theirs)
+    y = bending(1, seed=5)[0]
+    assert more.forecast(y, [math.inf]).mean.isfinite().all()
+    fewer = bent.rebuilt(30)
+    assert fewer.forecast(y, [math.inf]).mean.isfinite().all()
+
+
+def test_a_seed_reproduces(bent: InteractionModel) -> None:
+    again = learn(bending(60), **QUICK)
+    for ours, theirs in zip(bent.filter.parameters(), again.filter.parameters(), strict=True):
+        assert torch.equal(ours, theirs)
+
+
+def test_few_demonstrations_have_none_and_the_report_says_so() -> None:
+    model = learn(interactions(12), steps=0, scan=4)
+    assert not isinstance(model.filter.readout, AnalogueReadout)
+    assert any("no analogues: 12 demonstrations, 20" in remark for remark in model.report["remarks"])
+
+
+def test_a_correction_is_ridge_regression_judged_by_folds() -> None:
+    """The matrix that made the data, and no more of the mean than folds can show."""
+    draws = np.random.default_rng(0)
+    voices = torch.tensor(draws.standard_normal((60, 3, 2, 4)))
+    place = torch.eye(2).double().expand(60, 3, 2, 2)
+    true = torch.tensor(draws.standard_normal((2, 2, 2)))
+    noise = 0.1 * torch.tensor(draws.standard_normal((60, 3, 2, 2)))
+    wanted = torch.einsum("rkpj,pij->rkpi", voices[..., :2], true) + noise
+    wanted[3, 1] = torch.nan
+    fold = torch.arange(60) % 5
+    found = best_correction(voices, place, wanted, fold, 5)
+    for p in range(2):
+        x, y = voices[:, :, p].reshape(-1, 4).numpy(), wanted[:, :, p].reshape(-1, 2).numpy()
+        some = ~np.isnan(y).any(1)
+        x, y = x[some], y[some]
+        off = [
+            np.abs(np.linalg.solve(x.T @ x + np.diag([a, a, b, b]), x.T @ y).T - found.whole[p].numpy()).max()
+            for a in (30, 100, 300, 1000, 3000) for b in (100, 1e4, 1e8)
+        ]  # fmt: skip
+        assert min(off) < 1e-8
+    assert float((found.whole[..., :2] - true).abs().max()) < 0.35
+    assert float(found.whole[..., 2:].abs().max()) < 0.05
+    left_out = (wanted - found.left_out).square().nanmean()
+    assert float(left_out) < 0.3 * float(wanted.square().nanmean())
+
+
+def test_widths_are_those_that_hold_the_error() -> None:
+    """Of three deviations the one that tells the error is chosen, and stretched until 95 % lie within."""
+    draws = np.random.default_rng(0)
+    of_each = torch.tensor(draws.uniform(0.1, 3.0, (400, 2, 1, 2, 3)))
+    error = 0.5 * of_each[..., 1] * torch.tensor(draws.standard_normal((400, 2, 1, 2)))
+    fold = torch.arange(400) % 5
+    place = torch.ones(400, 2, 1, 1).double()
+    width, left_out = best_width(of_each, place, error, fold, 5)
+    assert float(width[0, 0, 1]) == pytest.approx(0.5, rel=0.1)
+    assert float(width[0, 0, [0, 2]].sum()) < 0.05
+    assert float((error.abs() <= 1.96 * left_out).double().mean()) == pytest.approx(0.95, abs=0.015)
+
+
+def test_what_was_seen_of_late_is_of_all_samples() -> None:
+    """As the filter itself remembers it at the full rate, however thinned it is when it learns."""
+    from tests.interaction.analogous import bent as made
+    from torch_ebip import InteractionPrimitive
+
+    known = interactions(6, dtype=torch.float64)
+    primitive = InteractionPrimitive.fit(known)
+    filter = made(primitive)
+    y, observed = known.pad()
+    observed = observed & ~known.layout.controlled
+    keep = torch.tensor([[4, 20]] * 6)
+    kept = filter(y, observed, keep=keep, generator=torch.Generator().manual_seed(0)).kept
+    sums = recent_sums(filter.analysis.recent, y, observed, keep, 1 / known.rate)
+    torch.testing.assert_close(sums, kept.memory.recent)
+    counts = torch.ones_like(y)
+    counts[:, :, 1] = 0
+    refused = recent_sums(filter.analysis.recent, y, observed, keep, 1 / known.rate, counts)
+    assert refused[..., 1].abs().max() == 0
+    torch.testing.assert_close(refused[..., 0], sums[..., 0])

@@ -1,0 +1,165 @@
+"""A read-out that bends: what came of analogues, corrected by the filter's forecast; as wide as both turn out to err.
+
+Two voices that err differently say more together than the better one (Wolpert 1992; Breiman's stacking, 1996). What
+one says of a DoF tells of others, too: where the filter sees the elbow elsewhere than analogues do, the wrist will be
+elsewhere. So the correction is a matrix over the DoFs of a modality (Breiman & Friedman 1997), for each horizon, and
+the same whatever sensors there are: what those tell is in the weights of analogues and in the filter's gain already.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from torch_ebip.common.ambient import owned
+from torch_ebip.common.arguments import as_values
+from torch_ebip.common.modules import sharing
+from torch_ebip.filtering.protocols import View
+from torch_ebip.interaction.analogues import Analogues
+from torch_ebip.interaction.forecast import Forecast
+from torch_ebip.interaction.horizons import SECONDS, horizon_hats
+from torch_ebip.interaction.present import Present
+from torch_ebip.interaction.readout import Lead, moved, root, widths_of
+
+VOICES = ("filter", "analogues", "mean")
+
+
+class AnalogueReadout(nn.Module):
+    """Mean h + B (f - h) + C (h - m), deviation a sigma_f + b sigma_h + c sigma_m, by horizon.
+
+    h is the forecast of analogues, a weighted mean of demonstrations, f the filter's, m the mean of all
+    demonstrations; sigma are their deviations. The filter's members keep their order and their weights: they are
+    moved with the mean and stretched with the deviation.
+
+    Args:
+        analogues: over the same layout.
+        follow: [K, D, D], B at the seconds. A DoF that nobody fitted has a row of the identity: the filter alone.
+        correct: [K, D, D], C; units of the row's DoF per unit of the column's, as B.
+        width: [K, D, 3], a, b and c, not negative and above 0 together.
+        seconds: [K] increasing; between them all are linear, before the first and behind the last as there.
+            Infinity, the last, is the end.
+
+    Raises:
+        ValueError: shapes that do not fit, numbers that are not finite, negative widths, seconds that do not
+            increase.
+
+    Example:
+        >>> import torch
+        >>> from torch_ebip import InteractionPrimitive
+        >>> from torch_ebip.interaction.analogue_readout import AnalogueReadout
+        >>> from torch_ebip.interaction.analogues import Analogues
+        >>> from torch_ebip.recordings import example
+        >>> primitive = InteractionPrimitive.fit(example())
+        >>> half = 0.5 * torch.eye(primitive.layout.n_dofs).expand(5, -1, -1)
+        >>> AnalogueReadout(Analogues.of(primitive), half, 0 * half, torch.ones(5, primitive.layout.n_dofs, 3) / 2)
+        AnalogueReadout(
+          11 DoFs, 5 horizons, follows the filter by 0.5
+          (analogues): Analogues(
+            30 demonstrations, 41 phases, compares 5 DoFs
+            (table): DemonstrationTable(30 demonstrations, 41 phases, 11 DoFs)
+            (relevance): Positive([2, 5], floor=1e-06)
+            (tilt): Signed()
+            (memory): Positive([], floor=1e-06)
+            (looseness): Positive([], floor=1e-06)
+          )
+        )
+    """
+
+    reads_present = True
+    follow: Tensor
+    correct: Tensor
+    width: Tensor
+    seconds: Tensor
+
+    def __init__(
+        self,
+        analogues: Analogues,
+        follow: Tensor,
+        correct: Tensor,
+        width: Tensor,
+        seconds: Sequence[float] = SECONDS,
+    ) -> None:
+        super().__init__()
+        places = as_values("seconds", list(seconds), None, follow)
+        if not len(places) or not bool((places.diff() > 0).all() & (places >= 0).all()):
+            raise ValueError(f"seconds must increase from 0 or more, got {places.tolist()}")
+        K, D = len(places), analogues.table.n_dofs
+        for name, values, shape in (
+            ("follow", follow, (K, D, D)),
+            ("correct", correct, (K, D, D)),
+            ("width", width, (K, D, len(VOICES))),
+        ):
+            if values.shape != shape or not bool(values.isfinite().all()):
+                raise ValueError(f"{name} must be {list(shape)} and finite, got {list(values.shape)}")
+        if not bool((width >= 0).all() & (width.sum(-1) > 0).all()):
+            raise ValueError(f"width must not be negative, and above 0 together, got {float(width.min()):g}")
+        self.analogues = analogues
+        self.register_buffer("follow", owned(follow))
+        self.register_buffer("correct", owned(correct))
+        self.register_buffer("width", owned(width))
+        self.register_buffer("seconds", owned(places))
+
+    def forward(
+        self, forecast: Forecast, lead: Lead, mean: Tensor, variance: Tensor, present: Present | None = None
+    ) -> Forecast:
+        """Put a forecast together with that of analogues.
+
+        Args:
+            forecast: of the filter, mean [..., P, D].
+            lead: of it, how far ahead it is.
+            mean: [..., P, D], of the demonstrations at the phases of the forecast, units of the DoFs.
+            variance: [..., P, D], of the demonstrations there, squared units.
+            present: of the state that the forecast is of.
+
+        Raises:
+            ValueError: nobody says what the present is.
+        """
+        if present is None:
+            raise ValueError("a read-out with analogues compares the present: it needs to be told")
+        theirs, spread = self.analogues.forecast(self.analogues(present), lead)
+        at = horizon_hats(lead, self.seconds)  # [..., P, K]
+        both = torch.cat([forecast.mean - theirs, theirs - mean], -1)
+        every = torch.einsum("...j,kij->...ki", both, torch.cat([self.follow, self.correct], -1))
+        stacked = theirs + (at.unsqueeze(-1) * every).sum(-2)
+        widths = widths_of(forecast, variance)
+        of_each = torch.stack([widths.own, root(spread), widths.demonstrated], -1)
+        deviation = (torch.einsum("...k,kdv->...dv", at, self.width) * of_each).sum(-1)
+        return moved(forecast, stacked, deviation, torch.ones_like(deviation), widths)
+
+    def together(self, dofs: Tensor) -> Tensor:
+        """Those that must be forecast for some DoFs, bool [D], to be: what they are corrected by is among them."""
+        coupled = ((self.follow != 0) | (self.correct != 0)).any(0).to(dofs.device)
+        return dofs | coupled[dofs].any(0)
+
+    def select(self, view: View) -> AnalogueReadout:
+        """The same for a view of the model: of its DoFs.
+
+        Raises:
+            ValueError: a view that cuts through DoFs that are forecast together.
+        """
+        dofs = view.dofs.to(self.follow.device)
+        kept = torch.zeros(self.follow.shape[-1], dtype=torch.bool, device=dofs.device)
+        kept[dofs] = True
+        missing = self.together(kept) & ~kept
+        if bool(missing.any()):
+            raise ValueError(
+                f"DoFs {missing.nonzero().squeeze(-1).tolist()} are forecast together with some of "
+                f"{dofs.tolist()}: keep all of them, or none"
+            )
+        part = sharing(self)
+        part.analogues = self.analogues.select(view)
+        part.register_buffer("follow", self.follow[:, dofs][:, :, dofs])
+        part.register_buffer("correct", self.correct[:, dofs][:, :, dofs])
+        part.register_buffer("width", self.width[:, dofs])
+        return part
+
+    def extra_repr(self) -> str:
+        """Sizes, and the mean of B's diagonal."""
+        K, D, _ = self.follow.shape
+        return f"{D} DoFs, {K} horizons, follows the filter by {float(self.follow.diagonal(0, 1, 2).mean()):.2g}"
+
+    def meant(self) -> str:
+        """What its tensors mean, see `Meaning`: nothing beside themselves."""
+        return ""

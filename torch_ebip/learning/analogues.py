@@ -1,0 +1,160 @@
+"""What near means to analogues, and how much they count beside the filter: from interactions left out.
+
+The parameters of the kernel are few, and tuned by gradient on what the analogues alone say of interactions that are
+none of them. They are the same for all sets of sensors that are shown, so that they serve others, too.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torch_ebip.common.ambient import without_autocast
+from torch_ebip.filtering.protocols import View
+from torch_ebip.filtering.states import map_state
+from torch_ebip.interaction.analogue_readout import VOICES, AnalogueReadout
+from torch_ebip.interaction.analogues import PORTION, Analogues
+from torch_ebip.interaction.present import Present
+from torch_ebip.interaction.readout import Lead
+from torch_ebip.learning.drawing import Drawn, asked_of, drawn_of
+from torch_ebip.learning.held_out import HeldOut
+from torch_ebip.learning.partition import generator_of
+from torch_ebip.learning.said import Said
+from torch_ebip.learning.stacking import best_correction, best_width
+
+FEWEST = 20
+"""Demonstrations below which nothing can be said of what near means."""
+MOMENTS = 10
+"""Of each interaction."""
+STEPS = 100
+"""Of the gradient."""
+ROWS = 96
+"""Moments a step."""
+RATE = 0.1
+"""Of Adam, at first; it falls along a half cosine."""
+PULL = 1e-3
+"""Weight of the squared distance of the parameters from where they start."""
+LIKELIHOOD = 0.1
+"""Weight of the likelihood beside the error: the spread of the analogues should tell theirs."""
+
+
+def moments_of(held_out: HeldOut) -> Tensor:
+    """[K], shares of an interaction at which its present is compared, within the settings' horizons."""
+    low, high = held_out.settings.horizons
+    return torch.linspace(low, min(high + 0.02, 1.0), MOMENTS, device="cpu")
+
+
+@without_autocast
+def fit_analogues(analogues: Analogues, held_out: HeldOut, said: Said) -> None:
+    """Tune the kernel of analogues over all targets.
+
+    Args:
+        analogues: changed.
+        held_out: the demonstrations, and what is asked of them: seconds ahead.
+        said: by a filter that remembers what was seen of late; by what it knew of the present.
+    """
+    assert said.present is not None
+    scale, head = held_out.task.objective.scale, _of_targets(held_out, analogues)
+    truth = (said.wanted + said.mean).flatten(0, 1)  # [RK, P, D], units of the scale
+    present: Present = map_state(lambda part: part.flatten(0, 1), said.present)
+    lead = _lead(held_out)
+    often = (~truth.isnan()).to(scale).mean((0, 2)).clamp(min=1e-6)
+    # Between them the variance of the analogues becomes one of forecasts; not kept.
+    spread = nn.Parameter(scale.new_tensor([0.0, -2.0]))
+    learned = [parameter for parameter in analogues.parameters() if parameter.requires_grad]
+    optimiser = torch.optim.Adam([*learned, spread], lr=RATE)
+    draws = generator_of(held_out.settings.seed, -5)
+    for step in range(STEPS):
+        optimiser.param_groups[0]["lr"] = RATE * 0.5 * (1 + math.cos(math.pi * step / STEPS)) + 0.03 * RATE
+        rows = torch.randint(len(truth), (ROWS,), generator=draws, device="cpu").to(truth.device)
+        some: Present = map_state(lambda part, rows=rows: part[rows], present)
+        with torch.enable_grad():
+            mean, variance = head.forecast(head(some), lead)
+            mean, variance = mean / scale, variance / scale.square()
+            measured = ~truth[rows].isnan()
+            error = torch.where(measured, truth[rows], mean.detach()) - mean
+            wide = variance * spread[0].exp() + spread[1].exp()
+            terms = 2 * ((1 + error.square()).sqrt() - 1) + LIKELIHOOD * (error.square() / wide + wide.log())
+            loss = (torch.where(measured, terms, 0).mean((0, 2)) / often).mean()
+            loss = loss + PULL * sum(parameter.square().sum() for parameter in learned)
+            optimiser.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_([*learned, spread], 2.0)
+        optimiser.step()
+    optimiser.zero_grad()
+
+
+@without_autocast
+@torch.no_grad()
+def learn_stacking(held_out: HeldOut, analogues: Analogues, said: Said, scored: Tensor) -> Drawn:
+    """How analogues are corrected by the filter and the mean, and how wide all together are.
+
+    Args:
+        held_out: the demonstrations, and what is asked of them: seconds ahead.
+        analogues: as they are.
+        said: by the filter, without a read-out, of the interactions that decide.
+        scored: int64 [S], those among them whose scores are told.
+    """
+    layout, objective, targets, ahead, names = asked_of(held_out)
+    scale = objective.scale
+    theirs, spread = _say(held_out, analogues, said)
+    fold = held_out.partition.fold_of.to(theirs.device)[said.interaction]
+    modality = layout.modality_of_dof.to(theirs.device)
+    S, D, V = said.place.shape[-1], layout.n_dofs, len(VOICES)
+    follow = torch.eye(D, dtype=theirs.dtype, device=theirs.device).repeat(S, 1, 1)
+    correct, width = torch.zeros_like(follow), theirs.new_zeros(S, D, V)
+    width[..., 0] = 1
+    drawn, deviation = torch.zeros_like(theirs), torch.zeros_like(theirs)
+    shares: dict[str, Any] = {}
+    for m in sorted(set(modality[targets].tolist())):
+        ours, here = modality[targets] == m, ((modality == m) & targets).nonzero().squeeze(-1)
+        voices = torch.cat([said.towards[..., ours] - theirs[..., ours], theirs[..., ours]], -1)
+        wanted, n = said.wanted[..., ours], len(here)
+        found = best_correction(voices, said.place, wanted - theirs[..., ours], fold, held_out.settings.folds)
+        # B and C are in units of the scale, which each horizon has of its own.
+        units = scale[:, ours]
+        per = units.unsqueeze(-1) / units.unsqueeze(-2)
+        follow[:, here.unsqueeze(-1), here] = found.whole[..., :n] * per
+        correct[:, here.unsqueeze(-1), here] = found.whole[..., n:] * per
+        drawn[..., ours] = theirs[..., ours] + found.left_out
+        of_each = torch.stack([said.own, spread, said.demonstrated], -1)[..., ours, :]
+        width[:, here], deviation[..., ours] = best_width(
+            of_each, said.place, wanted - drawn[..., ours], fold, held_out.settings.folds
+        )
+        diagonals = found.whole.view(S, n, 2, n).diagonal(0, 1, 3).mean(-1).tolist()  # [S, 2]
+        shares[layout.names[m]] = {
+            part: {name: round(values[i], 3) for name, values in zip(names, diagonals, strict=True)}
+            for i, part in enumerate(("follow", "correct"))
+        }
+    readout = AnalogueReadout(analogues, follow, correct, width, ahead.tolist())
+    return drawn_of(held_out, said, scored, readout, shares, drawn, deviation)
+
+
+def _say(held_out: HeldOut, analogues: Analogues, said: Said) -> tuple[Tensor, Tensor]:
+    """What analogues say less the mean, and their deviation, [R, K, P, D] of the targets, in units of the scale."""
+    head, lead, present = _of_targets(held_out, analogues), _lead(held_out), said.present
+    scale = held_out.task.objective.scale
+    rows = max(1, PORTION // (said.place[0, ..., 0].numel() * len(analogues.pace) * scale.shape[-1]))
+    parts = []
+    for i in range(0, len(said.interaction), rows):
+        some: Present = map_state(lambda part, i=i: part[i : i + rows], present)
+        parts.append(head.forecast(head(some), lead))
+    mean, variance = (torch.cat(each) for each in zip(*parts, strict=True))
+    return mean / scale - said.mean, variance.clamp(min=0).sqrt() / scale
+
+
+def _of_targets(held_out: HeldOut, analogues: Analogues) -> Analogues:
+    """The analogues of a task's targets."""
+    dofs = held_out.task.targets.nonzero().squeeze(-1)
+    return analogues.select(View(dofs, dofs))
+
+
+def _lead(held_out: HeldOut) -> Lead:
+    """Of forecasts that are asked for by seconds: nothing else of it is looked at."""
+    ahead = held_out.task.objective.ahead
+    assert ahead is not None
+    nothing = torch.zeros_like(ahead)
+    return Lead(nothing, nothing, nothing, nothing, ahead)
