@@ -21,16 +21,20 @@ import torch
 from experiments import moveint
 from experiments.command_line import add_data_options, add_run_options, command, experiment_parser
 from experiments.data import choose_subsets, load, thinning
-from experiments.entries import ALL, METHODS, WITHOUT, Fold
+from experiments.entries import METHODS, WITHOUT, Fold, without
 from experiments.evaluate import evaluate
 from experiments.figures import horizons_figure, results_figure
 from experiments.folds import LOST, mean_of_cells, read_values, run_folds, share_cores, split, write_values
 from experiments.paper_table import paper_rows
+from experiments.readouts import READOUTS
 from experiments.results import Values, markdown, print_tables, summarise
 from experiments.run_folder import RunFolder, save_figure
 from torch_ebip import TuningSettings
 from torch_ebip.common.files import atomic_write, read_json, write_json
 from torch_ebip.learning.ranks import RankLostError, Ranks
+
+ALL = METHODS | {name: without(name) for name in WITHOUT} | READOUTS
+"""All that can be asked for."""
 
 
 @dataclass(frozen=True)
@@ -185,7 +189,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--methods", nargs="+", choices=list(ALL), default=list(METHODS), metavar="METHOD",
         help=f"which to compare (default: {', '.join(METHODS)}; what each part of the tuned filter gives: "
-        f"{', '.join(WITHOUT)})",
+        f"{', '.join(WITHOUT)}; of its read-out: {', '.join(READOUTS)})",
     )  # fmt: skip
     parser.add_argument(
         "--subsets", nargs="+", default=[], metavar="SUBSET",

@@ -225,13 +225,11 @@ WITHOUT: dict[str, dict[str, Any]] = {
     "ebip_tuned_one_memory": {"memories": 1},
     "ebip_tuned_not_drawn": {"shrink": False},
     "ebip_tuned_no_gradient": {"steps": 0},
+    "ebip_tuned_no_analogues": {"analogues": False},
 }
 """What `learn` makes without one of its parts, by options of it."""
 
 
-def _without(name: str) -> Callable[[Fold], Method | None]:
+def without(name: str) -> Callable[[Fold], Method | None]:
+    """The builder of one of `WITHOUT`, by its name."""
     return _filter(lambda fold: fold.model(name, **WITHOUT[name]).filter)
-
-
-ALL = METHODS | {name: _without(name) for name in WITHOUT}
-"""All that can be asked for."""

@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
-from experiments.benchmark import caution, growth, sequences, startup, step
+from experiments.benchmark import bending, caution, growth, sequences, startup, step
 from experiments.command_line import add_run_options, command, experiment_parser
 from experiments.run_folder import RunFolder, save_figure
 
@@ -43,6 +43,7 @@ def main(arguments: list[str] | None = None) -> None:
         "grid": lambda: step.grid(max(100, rounds // 3), seed, options.quick),
         "growth": lambda: growth.growth(rounds // 2, seed),
         "caution": lambda: caution.caution(2 * rounds, seed, options.quick),
+        "bending": lambda: bending.bending(rounds, seed, options.quick),
         "fold": lambda: sequences.fold(1 if options.quick else 3, seed, samples),
         "tuning": lambda: sequences.tuning(seed, samples=samples),
         "startup": lambda: startup.startup(run.path, 2 if options.quick else 5),
@@ -113,6 +114,12 @@ def _print(results: Mapping[str, Any]) -> None:
     for row in results["caution"]:
         numbers = (row["with"], row["without"], row["with_over_without"])
         table.add_row(row["what"], *(f"{number:.3g}" for number in numbers))
+    console.print(table)
+    heads = ["horizons", "bends", "straight", "an update", "bends / update"]
+    table = _table("a forecast with analogues: reaches, 3 sensors, live, 1 thread, us", heads)
+    for row in results["bending"]:
+        numbers = (row["bends"], row["straight"], row["update"], row["bends_over_update"])
+        table.add_row(str(row["horizons"]), *(f"{number:.3g}" for number in numbers))
     console.print(table)
     heads = ["sensors", "threads", "us a step and interaction", "one at a time / together"]
     table = _table("a fold: 22 x 198 members x 100 samples x 559 weights", [*heads, "stepwise / together"])

@@ -1,8 +1,8 @@
 """Model files that earlier versions wrote are read, and say what they said then.
 
 Each in `former/` is a small model as a commit of before saved it, beside recorded values and what it forecast of
-them: the first version of the format, evidence with one memory, with two whose sharpness could only grow, and
-surprise that did not ask for a direction.
+them: the first version of the format, evidence with one memory, with two whose sharpness could only grow,
+surprise that did not ask for a direction and surprise that did, and forecasts without analogues.
 """
 
 from pathlib import Path
@@ -14,7 +14,7 @@ import torch
 from torch_ebip.learning import InteractionModel
 
 FORMER = Path(__file__).parent / "former"
-NAMES = ["first", "one_memory", "two_memories", "surprise"]
+NAMES = ["first", "one_memory", "two_memories", "surprise", "direction"]
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -63,7 +63,8 @@ def test_it_is_the_recipe_step_by_step(shrink: bool) -> None:
     filter = tunable(primitive, start)
     order = torch.cat([held_out.partition.validating, held_out.partition.training])
     if shrink:
-        said = what_it_says(held_out, filter, order)
+        with torch.no_grad():
+            said = what_it_says(held_out, filter, order)
         filter.readout = learn_drawing(held_out, said, held_out.partition.validating).readout
     result = Tuner(filter, known, *task, settings).run()
     assert score(held_out, filter, held_out.partition.validating)["loss"] == pytest.approx(
@@ -265,7 +266,7 @@ def test_progress_counts_to_the_end_and_never_back() -> None:
     assert done == sorted(done)
     assert seen[-1].done == seen[-1].total
     assert [*dict.fromkeys(progress.stage for progress in seen)] == [
-        "closed form", "factor", "start", "gradient", "shrinkage", "surprise"
+        "closed form", "factor", "start", "gradient", "read-out", "surprise"
     ]  # fmt: skip
     assert any("validation" in progress.text for progress in seen)
 
@@ -279,7 +280,7 @@ def interruptible():
 
 
 @pytest.mark.usefixtures("interruptible")
-@pytest.mark.parametrize("stage", ["factor", "gradient", "shrinkage", "surprise"])
+@pytest.mark.parametrize("stage", ["factor", "gradient", "read-out", "surprise"])
 def test_an_interrupt_keeps_the_best_so_far(stage: str, tmp_path: Path) -> None:
     """A signal as Ctrl-C sends it, in the middle of a stage; the folder then goes on to what a whole run gives."""
     known = interactions(20)

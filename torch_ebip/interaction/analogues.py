@@ -8,6 +8,7 @@ and how much each demonstration explained so far; what near means is learned.
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import torch
@@ -32,7 +33,7 @@ FAR = 5.0
 """Deviations beyond which all is equally far."""
 LEAST = 0.012
 """Deviation of the phase that is never gone below: half of what lies between the phases of the table."""
-REACH = 6.0
+REACH = 5.0
 """Deviations of the phase beyond which a pair has no say."""
 LEAST_SAY = 1e-9
 """Weight of a demonstration from which it is asked where it would be."""
@@ -50,6 +51,27 @@ class Analogy(NamedTuple):
 
     weights: Tensor
     phase: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self)
+
+
+class _Constants(NamedTuple):
+    """What depends on the demonstrations alone.
+
+    Attributes:
+        bank: [P, N, 4 k], f^2 and f of every pair, values before velocities.
+        middle, inverse, moved: [2, k], what is taken off, 1 / scale, and whether a DoF moves at all, 0 or 1.
+        sensors: [k, S], 1 where a DoF is a sensor's.
+        places: [P], phases.
+    """
+
+    bank: Tensor
+    middle: Tensor
+    inverse: Tensor
+    moved: Tensor
+    sensors: Tensor
+    places: Tensor
 
     def __repr__(self) -> str:
         return brief(self)
@@ -115,7 +137,7 @@ class Analogues(nn.Module):
         self.tilt = Signed(scale.new_zeros(2))
         self.memory = Positive(scale.new_tensor(MEMORY))
         self.looseness = Positive(scale.new_tensor(1.0))
-        self._kept: tuple[list[tuple[Tensor, int]], Tensor, Tensor] | None = None
+        self._kept: tuple[list[tuple[Tensor, int]], _Constants] | None = None
 
     @classmethod
     def of(cls, primitive: InteractionPrimitive, compared: Tensor | None = None) -> Analogues:
@@ -133,11 +155,8 @@ class Analogues(nn.Module):
         scale = torch.stack([primitive.value_variance.clamp(min=0).sqrt(), velocity.flatten(0, 1).std(0)])
         return cls(table, pace, scale.to(weights), layout.modality_of_dof, compared)
 
-    def _bank(self) -> tuple[Tensor, Tensor]:
-        """[P, N, 4 k], f^2 and f of every pair, f their values and velocities in deviations; and the middle, [k].
-
-        Kept while what it is made of stays as it is.
-        """
+    def _constants(self) -> _Constants:
+        """Kept while what they are made of stays as it is."""
         sources = (self.table.cells, self.pace, self.scale)
         versions = [(source, -1 if source.is_inference() else source._version) for source in sources]
         kept = self._kept  # another thread may exchange it
@@ -145,19 +164,21 @@ class Analogues(nn.Module):
             ours is not theirs or now != then or now < 0
             for (ours, now), (theirs, then) in zip(versions, kept[0], strict=True)
         ):
-            values = _values(self.table)[..., self.dofs]
-            middle = values.mean((0, 1))
-            velocities = _slopes(self.table)[..., self.dofs] * self.pace[:, None, None]
-            both = torch.cat([self._scaled(values - middle, 0), self._scaled(velocities, 1)], -1).transpose(0, 1)
-            self._kept = kept = versions, torch.cat([both.square(), both], -1).contiguous(), middle
-        return outside_inference(kept[1]), outside_inference(kept[2])
+            self._kept = kept = versions, self._computed()
+        return _Constants(*(outside_inference(part) for part in kept[1]))
 
-    def _scaled(self, values: Tensor, group: int) -> Tensor:
-        """Differences from the centre, or velocities, [..., k] in deviations; 0 of a DoF that never moved."""
-        scale = self.scale[group]
-        moved = scale > 0
-        scaled = torch.where(moved, values, 0) / torch.where(moved, scale, 1)
-        return scaled.clamp(-FAR, FAR)
+    def _computed(self) -> _Constants:
+        values = _values(self.table)[..., self.dofs]
+        velocities = _slopes(self.table)[..., self.dofs] * self.pace[:, None, None]
+        middle = torch.stack([values.mean((0, 1)), torch.zeros_like(values[0, 0])])
+        moved = self.scale > 0
+        inverse = torch.where(moved, 1 / torch.where(moved, self.scale, 1), 0)
+        both = (torch.stack([values, velocities], -2) - middle) * inverse
+        flat = both.clamp(-FAR, FAR).flatten(-2).transpose(0, 1)
+        sensors = nn.functional.one_hot(self.modality_of_dof).to(values)
+        places = torch.linspace(0, 1, values.shape[1], dtype=values.dtype, device=values.device)
+        bank = torch.cat([flat.square(), flat], -1).contiguous()
+        return _Constants(bank, middle, inverse, moved.to(values), sensors, places)
 
     def forward(self, present: Present) -> Analogy:
         """Which demonstrations the present [...] is like; differentiable.
@@ -165,7 +186,7 @@ class Analogues(nn.Module):
         Args:
             present: of a state, over the layout's D DoFs.
         """
-        batch, N, P = present.phase.shape, len(self.pace), self.n_phases
+        batch, (N, P) = present.phase.shape, self.table.cells.shape[:2]
         line = present.line
         flat = Present(
             present.phase.reshape(-1),
@@ -181,40 +202,39 @@ class Analogues(nn.Module):
     def _weigh(self, present: Present, rows: slice) -> Analogy:
         """Of some rows of a flat batch."""
         phase, prior = present.phase[rows].clamp(0, 1), present.prior[rows]
-        bank, middle = self._bank()
+        constants = self._constants()
+        bank, places = constants.bank, constants.places
+        variance = (present.variance[rows] * self.looseness.value.square()).clamp(min=LEAST**2)
+        near = _reached(phase, variance, len(places))
+        bank, places = bank[near], places[near]
         P, N, _ = bank.shape
-        x, shares = self._seen(Line(*(part[rows] for part in present.line)), middle)
+        x, shares = self._seen(Line(*(part[rows] for part in present.line)), constants)
         late = (phase - 0.5).unsqueeze(-1) * self.tilt.value
         shares = shares * (self.relevance.value * late.exp().unsqueeze(-1))  # [R, 2, k]
-        shares, x = shares.flatten(1), x.flatten(1)
         # c (x - f)^2 without c x^2, which all pairs have in common.
-        distance = torch.cat([shares, -2 * shares * x], -1) @ bank.flatten(0, 1).T
-        places = torch.linspace(0, 1, P, dtype=phase.dtype, device=phase.device)
-        variance = (present.variance[rows] * self.looseness.value.square()).clamp(min=LEAST**2)
+        distance = torch.cat([shares, -2 * shares * x], -2).flatten(1) @ bank.flatten(0, 1).T
         off = (places - phase.unsqueeze(-1)).square() / variance.unsqueeze(-1)
         off = torch.where(off <= REACH**2, off, torch.inf)
         there = prior > -torch.inf
         known = torch.where(there, self.memory.value * torch.where(there, prior, 0), -torch.inf)
-        logits = known.unsqueeze(-2) - 0.5 * (distance.view(-1, P, N) + off.unsqueeze(-1))
+        logits = torch.add(known.unsqueeze(-2) - 0.5 * off.unsqueeze(-1), distance.view(-1, P, N), alpha=-0.5)
         weights = torch.softmax(logits.flatten(1), -1).view_as(logits)
         each = weights.sum(-2)
         # The quotient of what has next to no say has a gradient without bounds.
         some = each > LEAST_SAY
-        where = (weights * places.unsqueeze(-1)).sum(-2) / torch.where(some, each, 1)
+        where = (places @ weights) / torch.where(some, each, 1)
         return Analogy(each, torch.where(some, where, phase.unsqueeze(-1)))
 
-    def _seen(self, line: Line, middle: Tensor) -> tuple[Tensor, Tensor]:
+    def _seen(self, line: Line, constants: _Constants) -> tuple[Tensor, Tensor]:
         """x and c [R, 2, k] of lines."""
-        value, velocity = (part[..., self.dofs] for part in (line.value, line.velocity))
-        x = torch.stack([self._scaled(value - middle, 0), self._scaled(velocity, 1)], -2)
-        here = line.belief[..., self.dofs]
-        here = torch.stack([here, here * line.moves[..., self.dofs]], -2) * (self.scale > 0)
-        x = torch.where(here > 0, x, 0)
-        sensors = nn.functional.one_hot(self.modality_of_dof).to(here)
-        total, squares = here @ sensors, here.square() @ sensors
+        belief = line.belief
+        parts = torch.stack([line.value, line.velocity, belief, belief * line.moves], -2)[..., self.dofs]
+        x = ((parts[..., :2, :] - constants.middle) * constants.inverse).clamp(-FAR, FAR)
+        here = parts[..., 2:, :] * constants.moved
+        total, squares = here @ constants.sensors, here.square() @ constants.sensors
         # Of a sensor whose DoFs are all believed alike each has an equal share, together as much as one is believed.
         share = squares / torch.where(total > 0, total, 1).square()
-        return x, here * (share @ sensors.T)
+        return x, here * (share @ constants.sensors.T)
 
     def forecast(self, analogy: Analogy, lead: Lead) -> tuple[Tensor, Tensor]:
         """Mean and variance [..., P, D] of what came of them: each at its own pace where seconds were asked for.
@@ -243,11 +263,6 @@ class Analogues(nn.Module):
         part.register_buffer("rows", self.rows[view.dofs.to(self.rows.device)], persistent=False)
         return part
 
-    @property
-    def n_phases(self) -> int:
-        """P."""
-        return self.table.cells.shape[1] + 1
-
     def __getstate__(self) -> dict[str, Any]:
         """Copies and pickles have nothing kept."""
         return {**self.__dict__, "_kept": None}
@@ -258,7 +273,17 @@ class Analogues(nn.Module):
 
     def extra_repr(self) -> str:
         """Sizes."""
-        return f"{len(self.pace)} demonstrations, {self.n_phases} phases, compares {len(self.dofs)} DoFs"
+        P = self.table.cells.shape[1]
+        return f"{len(self.pace)} demonstrations, {P + 1} phases, compares {len(self.dofs)} DoFs"
+
+
+def _reached(phase: Tensor, variance: Tensor, count: int) -> slice:
+    """Those of ``count`` phases that are within `REACH` of some phase [R]."""
+    reach = REACH * variance.detach().sqrt()
+    low, high = float((phase - reach).min()), float((phase + reach).max())
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return slice(0, count)
+    return slice(max(math.floor(low * (count - 1)), 0), min(math.ceil(high * (count - 1)), count - 1) + 1)
 
 
 def _values(table: DemonstrationTable) -> Tensor:

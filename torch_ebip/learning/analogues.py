@@ -89,7 +89,9 @@ def fit_analogues(analogues: Analogues, held_out: HeldOut, said: Said) -> None:
 
 @without_autocast
 @torch.no_grad()
-def learn_stacking(held_out: HeldOut, analogues: Analogues, said: Said, scored: Tensor) -> Drawn:
+def learn_stacking(
+    held_out: HeldOut, analogues: Analogues, said: Said, scored: Tensor, corrected: bool = True
+) -> Drawn:
     """How analogues are corrected by the filter and the mean, and how wide all together are.
 
     Args:
@@ -97,6 +99,7 @@ def learn_stacking(held_out: HeldOut, analogues: Analogues, said: Said, scored: 
         analogues: as they are.
         said: by the filter, without a read-out, of the interactions that decide.
         scored: int64 [S], those among them whose scores are told.
+        corrected: otherwise analogues speak alone.
     """
     layout, objective, targets, ahead, names = asked_of(held_out)
     scale = objective.scale
@@ -111,7 +114,7 @@ def learn_stacking(held_out: HeldOut, analogues: Analogues, said: Said, scored: 
     shares: dict[str, Any] = {}
     for m in sorted(set(modality[targets].tolist())):
         ours, here = modality[targets] == m, ((modality == m) & targets).nonzero().squeeze(-1)
-        voices = torch.cat([said.towards[..., ours] - theirs[..., ours], theirs[..., ours]], -1)
+        voices = int(corrected) * torch.cat([said.towards[..., ours] - theirs[..., ours], theirs[..., ours]], -1)
         wanted, n = said.wanted[..., ours], len(here)
         found = best_correction(voices, said.place, wanted - theirs[..., ours], fold, held_out.settings.folds)
         # B and C are in units of the scale, which each horizon has of its own.

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torch_ebip.common.files import write_json
+from torch_ebip.interaction.analogues import Analogues
 from torch_ebip.interaction.basis.selection import rank_candidates, select_basis, selection_table
 from torch_ebip.interaction.basis.stacked import StackedBasis
 from torch_ebip.interaction.filter_kinds import InteractionEnsembleFilter
@@ -44,8 +45,8 @@ from torch_ebip.recordings.demonstrations import Demonstrations
 PROCEDURE = 4  # what another edition of this file began in a folder is not gone on with
 FEWEST = 10
 """Demonstrations below which there is no gradient: those kept for validation would say nothing."""
-MOST = 200
-"""Interactions that decide about a read-out, at most."""
+DECIDING, MOST = 200, 100
+"""Interactions that decide about a read-out, and about recognition, at most."""
 WEIGHING = ("start", "gradient")
 """Stages whose filters remember what they saw, which a model of labelled interactions must."""
 
@@ -98,6 +99,7 @@ class Procedure:
         masks = {name: layout.mask(names).to(targets.device) for name, names in self.subsets.items()}
         self.task = Task(primitive, objective, targets, masks)
         self.held_out = HeldOut(self.known, self.task, self.settings, self.ranks)
+        self.deciding = self.held_out.partition.order[: max(DECIDING, len(self.scored))]
 
     def _horizons(self) -> list[float]:
         """The horizons that enough demonstrations reach; of the others the report says so."""
@@ -209,7 +211,7 @@ class Procedure:
         self.reporter.stage("gradient")
         filter = tunable(self.primitive, Start(**self.said["start"]), self.members)
         if self.shrink:  # What is minimised is what will be said.
-            filter.readout = learn_readout(self.held_out, filter, self._deciding, self.scored, False).drawn.readout
+            filter.readout = learn_readout(self.held_out, filter, self.deciding, self.scored, None).drawn.readout
         last = 0
 
         def show(step: int, loss: float, validation: float) -> None:
@@ -231,9 +233,10 @@ class Procedure:
         self._stage("gradient", filter)
 
     def _draw(self, filter: InteractionEnsembleFilter) -> Drawn:
-        """What the forecasts of a filter pass through: see `learn_readout`."""
+        """See `learn_readout`."""
         self.reporter.stage("read-out")
-        found = learn_readout(self.held_out, filter, self._deciding, self.scored, self.shrink and self.analogues)
+        make = Analogues.of if self.shrink and self.analogues else None
+        found = learn_readout(self.held_out, filter, self.deciding, self.scored, make)
         if self.shrink:
             self.said |= found.said
             self.scores |= found.scores
@@ -242,11 +245,6 @@ class Procedure:
             filter.readout = None
         self.reporter.tick()
         return found.drawn
-
-    @property
-    def _deciding(self) -> Tensor:
-        """int64 [B], the interactions that decide about a read-out."""
-        return self.held_out.partition.order[: max(MOST, len(self.scored))]
 
     def _recognise(self, filter: InteractionEnsembleFilter) -> None:
         """How sure the filter may be of a label."""

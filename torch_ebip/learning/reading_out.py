@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -12,11 +13,15 @@ from torch_ebip.common.brief import brief
 from torch_ebip.interaction.analogues import Analogues
 from torch_ebip.interaction.filter_kinds import InteractionEnsembleFilter
 from torch_ebip.interaction.present import recent_of
+from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.learning.analogues import FEWEST, fit_analogues, learn_stacking, moments_of
 from torch_ebip.learning.drawing import Drawn, learn_drawing
 from torch_ebip.learning.held_out import HeldOut
 from torch_ebip.learning.said import what_it_says
 from torch_ebip.learning.stages import Scores
+
+Makes: TypeAlias = "Callable[[InteractionPrimitive, Tensor], Analogues]"
+"""Analogues of a primitive that compare some DoFs, bool [D]."""
 
 
 class ReadOut(NamedTuple):
@@ -40,7 +45,13 @@ class ReadOut(NamedTuple):
 
 @without_autocast
 def learn_readout(
-    held_out: HeldOut, filter: InteractionEnsembleFilter, interactions: Tensor, scored: Tensor, analogues: bool
+    held_out: HeldOut,
+    filter: InteractionEnsembleFilter,
+    interactions: Tensor,
+    scored: Tensor,
+    analogues: Makes | None,
+    choose: bool = True,
+    corrected: bool = True,
 ) -> ReadOut:
     """Give a filter the read-out with the smaller CRPS on interactions left out.
 
@@ -49,26 +60,28 @@ def learn_readout(
         filter: changed; it has no read-out yet.
         interactions: int64 [B], that decide.
         scored: int64 [S], those among them whose scores are told.
-        analogues: whether they are tried.
+        analogues: what makes them, such as `Analogues.of`; None: they are not tried.
+        choose: whether they must be better; otherwise they are used wherever they can be.
+        corrected: whether they are corrected by the filter and the mean, see `AnalogueReadout`.
     """
     remarks = []
     task = held_out.task
-    if analogues and len(task.primitive) < FEWEST:
+    if analogues is not None and len(task.primitive) < FEWEST:
         remarks.append(f"no analogues: {len(task.primitive)} demonstrations, {FEWEST} tell what near means")
-        analogues = False
-    if analogues:
+        analogues = None
+    if analogues is not None:
         filter.analysis.recent = recent_of(task.primitive)
     with torch.no_grad():
-        said = what_it_says(held_out, filter, interactions, moments_of(held_out) if analogues else None)
+        said = what_it_says(held_out, filter, interactions, None if analogues is None else moments_of(held_out))
     drawn = learn_drawing(held_out, said, scored)
     scores, told = {"shrinkage": drawn.scores}, {"shrinkage": drawn.shares}
-    if analogues:
+    if analogues is not None:
         shown = torch.stack(list(task.subsets.values())).any(0)
-        head = Analogues.of(task.primitive, shown)
+        head = analogues(task.primitive, shown)
         fit_analogues(head, held_out, said)
-        stacked = learn_stacking(held_out, head, said, scored)
+        stacked = learn_stacking(held_out, head, said, scored, corrected)
         scores["analogues"] = stacked.scores
-        used = stacked.scores["crps"] < drawn.scores["crps"]
+        used = not choose or stacked.scores["crps"] < drawn.scores["crps"]
         told["analogues"] = {"used": used, "shares": stacked.shares, "crps": round(stacked.scores["crps"], 5),
                              "crps_without": round(drawn.scores["crps"], 5)}  # fmt: skip
         if used:

@@ -13,20 +13,17 @@ from torch import Tensor
 from torch_ebip.learning.metrics import Z95
 
 SWEEPS = 200
-"""Of coordinate descent on a handful of shares, at most; it ends when none changes by `CLOSE`."""
-CLOSE = 1e-7
+"""Of coordinate descent on a handful of shares."""
 DOUBT, CERTAIN = 1.5, 4.0
 """Standard errors of a gain below which it counts for nothing, and above which it counts for all of it."""
 FEWEST = 50
 """Forecasts that decide about a deviation, at least."""
 FACTORS = (0.3, 5.0)
 """Between which deviations are stretched."""
-ROUNDS = 4
-"""Of reweighting, where single interactions are not to decide."""
 
 
 def best_shares(
-    voices: Tensor, place: Tensor, wanted: Tensor, fold: Tensor, folds: int, pull: float, robust: bool = False
+    voices: Tensor, place: Tensor, wanted: Tensor, fold: Tensor, folds: int, pull: float
 ) -> tuple[Tensor, Tensor]:
     """Shares [S, V] of V voices at S horizons in [0, 1], and those learned without each of F folds, [F, S, V].
 
@@ -36,54 +33,38 @@ def best_shares(
         wanted: [R, K, P, D], truth less the mean, in the same units; NaN: not measured.
         fold: int64 [R].
         folds: F.
-        pull: towards 1, or an equal part of it where there are several voices, as a share of what voices vary.
-        robust: whether errors beyond one spread count less, as in pseudo-Huber's loss.
+        pull: towards 1, as a share of what voices vary.
     """
     S, V = place.shape[-1], voices.shape[-1]
     measured = ~wanted.isnan()
-    towards = 1.0 if not robust else 1 / V
-    rows = []
+    grams, moments = [], []
     for f in range(folds):
         ours = fold == f
-        basis = (place[ours][..., None, :, None] * voices[ours].unsqueeze(-2))[measured[ours]].flatten(-2)
-        rows.append((basis.double(), wanted[ours][measured[ours]].double()))
-    several = [torch.ones_like(each[1]) for each in rows]
-    whole: list[Tensor] = []
-    without: list[Tensor] = []
-    zero = voices.new_zeros((), dtype=torch.double)
-    for left_out in (None, *range(folds)):
-        weights, share = several, voices.new_zeros(S * V)
-        for _ in range(ROUNDS if robust else 1):
-            used = [f for f in range(folds) if f != left_out]
-            gram = sum(((rows[f][0] * weights[f].unsqueeze(-1)).T @ rows[f][0] for f in used), zero)
-            moment = sum((rows[f][0].T @ (weights[f] * rows[f][1]) for f in used), zero)
-            share = within(gram, moment, pull, towards)
-            if robust:
-                weights = [(1 + (y - basis @ share).square()).rsqrt() for basis, y in rows]
-        (whole if left_out is None else without).append(share.to(voices).view(S, V))
-    return whole[0], torch.stack(without)
+        basis = (place[ours][..., None, :, None] * voices[ours].unsqueeze(-2))[measured[ours]].flatten(-2).double()
+        grams.append(basis.T @ basis)
+        moments.append(basis.T @ wanted[ours][measured[ours]].double())
+    gram, moment = torch.stack(grams), torch.stack(moments)
+    best = within(gram.sum(0), moment.sum(0), pull).to(voices).view(S, V)
+    without = [within(gram.sum(0) - gram[f], moment.sum(0) - moment[f], pull) for f in range(folds)]
+    return best, torch.stack(without).to(voices).view(folds, S, V)
 
 
-def within(gram: Tensor, moment: Tensor, pull: float, towards: float = 1.0) -> Tensor:
-    """Shares [J] in [0, 1] that minimise s' G s - 2 s' m, by coordinate descent.
+def within(gram: Tensor, moment: Tensor, pull: float) -> Tensor:
+    """Shares [J] in [0, 1] that minimise s' G s - 2 s' m, pulled towards 1, by coordinate descent.
 
     Args:
         gram: G, [J, J].
         moment: m, [J].
-        pull: weight of the distance from ``towards``, as a share of the mean of the diagonal.
-        towards: a share.
+        pull: weight of the distance from 1, as a share of the mean of the diagonal.
     """
     ridge = pull * gram.diagonal().mean() + 1e-12
     gram = gram + ridge * torch.eye(len(gram), dtype=gram.dtype, device=gram.device)
-    moment = moment + ridge * towards
-    rows, goals, share = gram.tolist(), moment.tolist(), [towards] * len(moment)
+    moment = moment + ridge
+    rows, goals, share = gram.tolist(), moment.tolist(), [1.0] * len(moment)
     for _ in range(SWEEPS):
-        before = list(share)
         for k, row in enumerate(rows):
             rest = goals[k] - sum(g * s for g, s in zip(row, share, strict=True)) + row[k] * share[k]
             share[k] = min(max(rest / row[k], 0.0), 1.0)
-        if max(abs(a - b) for a, b in zip(share, before, strict=True)) < CLOSE:
-            break
     return moment.new_tensor(share)
 
 

@@ -1,0 +1,58 @@
+"""What a forecast with analogues costs, beside one without and an update, on the live path."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from experiments.surprise.reaches import reaches
+from experiments.timing import interleaved, threads
+from torch_ebip import AnalogueReadout, Analogues, InteractionPrimitive, LiveFilter, ebip
+from torch_ebip.interaction.horizons import SECONDS
+from torch_ebip.interaction.present import recent_of
+
+
+def bending(rounds: int, seed: int, quick: bool) -> list[dict[str, Any]]:
+    """Three sensors, 8 DoFs, one thread, half-way through an interaction: a row each for one horizon and for five.
+
+    Args:
+        rounds: calls that count.
+        seed: of data and draws.
+        quick: 40 members, not 200.
+    """
+    count = 40 if quick else 200
+    primitive = InteractionPrimitive.fit(reaches(count, 10 * seed + 1))
+    path, observed = reaches(1, 10 * seed + 2)[0].nan_to_num(), ~primitive.layout.controlled
+    lives = {name: _live(primitive, name == "bends", observed, path, seed) for name in ("bends", "straight")}
+    sample = path[len(path) // 2]
+    rows = []
+    for horizons in ((0.3,), SECONDS):
+        asked: dict[str, Callable[[], object]] = {
+            name: lambda live=live, horizons=horizons: live.forecast(dofs=~observed, ahead=list(horizons))
+            for name, live in lives.items()
+        }
+        asked["update"] = lambda: lives["bends"].update(sample, observed)
+        with threads(1):
+            timings = interleaved(asked, rounds, warmup=20)
+        microseconds = {key: 1e6 * timing.median for key, timing in timings.items()}
+        row = {"horizons": len(horizons), **microseconds, "members": count}
+        rows.append(row | {"bends_over_update": microseconds["bends"] / microseconds["update"]})
+    return rows
+
+
+def _live(primitive: InteractionPrimitive, bends: bool, observed: torch.Tensor, path: torch.Tensor, seed: int) -> Any:
+    """A filter that has seen half of a path."""
+    filter = ebip(primitive, weigh=True, square_root=True)
+    if bends:
+        D, K = primitive.layout.n_dofs, len(SECONDS)
+        half = 0.5 * torch.eye(D).repeat(K, 1, 1)
+        filter.analysis.recent = recent_of(primitive)
+        filter.readout = AnalogueReadout(Analogues.of(primitive), half, 0.1 * half, torch.ones(K, D, 3) / 3)
+    live = LiveFilter(filter, observed, generator=torch.Generator().manual_seed(seed))
+    for step, sample in enumerate(path[: len(path) // 2]):
+        if step:
+            live.predict()
+        live.update(sample, observed)
+    return live
