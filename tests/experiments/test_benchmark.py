@@ -5,7 +5,7 @@ from importlib.util import find_spec
 import pytest
 import torch
 
-from experiments.benchmark import growth, step
+from experiments.benchmark import bending, growth, step
 from experiments.benchmark.floor import floor
 from experiments.benchmark.problem import make_problem
 from experiments.benchmark.versions import Loop
@@ -53,3 +53,9 @@ def test_growth_reports_every_size(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = growth.growth(3, 0)
     assert [row["varied"] for row in rows] == ["members", "batch"]
     assert all(len(row["microseconds"]) == 2 and min(row["microseconds"]) > 0 for row in rows)
+
+
+def test_a_forecast_that_bends_is_timed_beside_one_that_does_not() -> None:
+    rows = bending.bending(3, 0, quick=True)
+    assert [row["horizons"] for row in rows] == [1, 5]
+    assert all(row["bends"] > row["straight"] > 0 for row in rows)

@@ -65,10 +65,11 @@ def test_the_tuned_filter_without_its_parts_is_another(recordings: str, tmp_path
     compare.main(["--data", recordings, "--quick", "--steps", "2", *few, "--out", str(tmp_path / "run")])
     reports = {name: json.loads((tmp_path / f"run/fold-00/{name}/report.json").read_text()) for name in names}
     settings = {name: report["settings"] for name, report in reports.items()}
-    assert [settings[name]["memories"] for name in names] == [2, 1, 2, 2]
-    assert [settings[name]["ahead"] == ["end"] for name in names] == [True, False, False, False]
-    assert ["shrinkage" in reports[name] for name in names] == [True, True, False, True]
-    assert ["gradient" in reports[name]["stages"] for name in names] == [True, True, True, False]
+    assert [settings[name]["memories"] for name in names] == [2, 1, 2, 2, 2]
+    assert [settings[name]["ahead"] == ["end"] for name in names] == [True, False, False, False, False]
+    assert ["shrinkage" in reports[name] for name in names] == [True, True, False, True, True]
+    assert ["gradient" in reports[name]["stages"] for name in names] == [True, True, True, False, True]
+    assert [settings[name]["analogues"] for name in names] == [True, True, True, True, False]
     results = json.loads((tmp_path / "run/results.json").read_text())
     means = [
         tuple(row["mean"] for row in results["rows"] if row["method"] == name and row["metric"] == "mae")

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from torch_ebip.common.ambient import eager
 from torch_ebip.common.draws import Generators
-from torch_ebip.filtering import functional
 from torch_ebip.filtering.base import EngineName, Filter
 from torch_ebip.filtering.protocols import MayLeaveSpan, View
 from torch_ebip.filtering.states import Memory, State
@@ -20,7 +19,7 @@ from torch_ebip.interaction.bounds import Bounds
 from torch_ebip.interaction.doubt import Doubt
 from torch_ebip.interaction.forecast import Forecast, Phases, as_phases, as_seconds_ahead
 from torch_ebip.interaction.phases.phase import PhaseModel
-from torch_ebip.interaction.present import Present, prior_of
+from torch_ebip.interaction.present import Present, present_of
 from torch_ebip.interaction.projection import BasisProjection
 from torch_ebip.interaction.readout import Lead, Readout, lead_of
 from torch_ebip.interaction.recognition import Recognition
@@ -175,12 +174,8 @@ class InteractionFilter(Filter):
         memory, recent = getattr(state, "memory", None), getattr(getattr(self, "analysis", None), "recent", None)
         if memory is None or recent is None or memory.recent is None:
             raise ValueError("nobody remembers what was seen of late: the filter's update has no `Recent`")
-        moving, weights = self.model.split(state[0])[0], state.weights
-        phase = moving[..., :1]
-        mean = functional.ensemble_mean(phase, weights).squeeze(-1)
-        variance = functional.ensemble_variance(phase, weights).squeeze(-1)
         count = len(self.prior.states)  # type: ignore[arg-type]
-        return Present(mean, variance, prior_of(memory, count), recent.line(memory.recent))
+        return present_of(state[0][..., 0], memory, recent, count)
 
     def doubted(self, state: State) -> Tensor:
         """[...], how surprising the interaction of a ``state`` is of late, see `InteractionSurprise.doubt`."""

@@ -45,6 +45,27 @@ def recent_of(primitive: InteractionPrimitive, window: float = WINDOW) -> Recent
     return Recent(middle, window)
 
 
+def present_of(phase: Tensor, memory: Memory, recent: Recent, count: int) -> Present:
+    """The present of members at phases [..., E] and of their memory.
+
+    Args:
+        phase: [..., E].
+        memory: of members that started as some of ``count`` demonstrations.
+        recent: of the update, that knows what is remembered of late.
+        count: N.
+
+    Raises:
+        ValueError: see `prior_of`.
+    """
+    assert memory.recent is not None
+    weighting = memory.weighting
+    weights = torch.full_like(phase, 1 / phase.shape[-1]) if weighting is None else weighting.weights
+    mean = (weights * phase).sum(-1)
+    square = (weights * (phase - mean.unsqueeze(-1)).square()).sum(-1)
+    variance = square / (1 - weights.square().sum(-1))  # as that of an ensemble
+    return Present(mean, variance, prior_of(memory, count), recent.line(memory.recent))
+
+
 def prior_of(memory: Memory, count: int) -> Tensor:
     """[..., N], see `Present.prior`, of a memory of members that started as some of ``count`` demonstrations.
 
