@@ -29,7 +29,7 @@ FEWEST = 20
 """Demonstrations below which nothing can be said of what near means."""
 MOMENTS = 10
 """Of each interaction."""
-STEPS = 100
+STEPS = 50
 """Of the gradient."""
 ROWS = 96
 """Moments a step."""
@@ -82,8 +82,9 @@ def fit_analogues(analogues: Analogues, held_out: HeldOut, said: Said) -> None:
             loss = loss + PULL * sum(parameter.square().sum() for parameter in learned)
             optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
-        nn.utils.clip_grad_norm_([*learned, spread], 2.0)
-        optimiser.step()
+        # One absurd moment is no reason to forget what the others taught.
+        if bool(nn.utils.clip_grad_norm_([*learned, spread], 2.0).isfinite()):
+            optimiser.step()
     optimiser.zero_grad()
 
 
