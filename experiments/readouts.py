@@ -20,11 +20,9 @@ from torch_ebip.interaction.analogues import Analogy
 from torch_ebip.interaction.present import Present
 from torch_ebip.learning.configuration import Task
 from torch_ebip.learning.held_out import HeldOut
+from torch_ebip.learning.procedure import DECIDING
 from torch_ebip.learning.reading_out import Makes, learn_readout
 from torch_ebip.learning.settings import settings_for
-
-DECIDING = 200
-"""Interactions that decide about a read-out, as in `learn`."""
 
 
 class Forgetful(Analogues):

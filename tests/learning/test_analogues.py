@@ -3,16 +3,31 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from tests.conftest import interactions
-from torch_ebip import Demonstrations, Layout, Modality, learn
+from tests.conftest import interactions, small_primitive
+from tests.interaction.analogous import bent as made
+from torch_ebip import (
+    Demonstrations,
+    ForecastObjective,
+    InteractionFilter,
+    InteractionPrimitive,
+    Layout,
+    Modality,
+    TuningSettings,
+    bip,
+    learn,
+    particle_filter,
+)
 from torch_ebip.interaction import AnalogueReadout
 from torch_ebip.learning import InteractionModel
+from torch_ebip.learning.configuration import Task
+from torch_ebip.learning.held_out import HeldOut, Trial
 from torch_ebip.learning.recently import recent_sums
 from torch_ebip.learning.stacking import best_correction, best_width
 
@@ -149,9 +164,6 @@ def test_widths_are_those_that_hold_the_error() -> None:
 
 def test_what_was_seen_of_late_is_of_all_samples() -> None:
     """As the filter itself remembers it at the full rate, however thinned it is when it learns."""
-    from tests.interaction.analogous import bent as made
-    from torch_ebip import InteractionPrimitive
-
     known = interactions(6, dtype=torch.float64)
     primitive = InteractionPrimitive.fit(known)
     filter = made(primitive)
@@ -166,3 +178,36 @@ def test_what_was_seen_of_late_is_of_all_samples() -> None:
     refused = recent_sums(filter.analysis.recent, y, observed, keep, 1 / known.rate, counts)
     assert refused[..., 1].abs().max() == 0
     torch.testing.assert_close(refused[..., 0], sums[..., 0])
+
+
+def trial_of(filter: InteractionFilter, primitive: InteractionPrimitive, thinning: int) -> tuple[HeldOut, Trial]:
+    """Six interactions as others see them."""
+    targets = primitive.layout.controlled
+    objective = ForecastObjective(primitive, targets, ahead=[0.1, math.inf])
+    task = Task(primitive, objective, targets, {"all": ~targets})
+    held_out = HeldOut(interactions(24, dtype=torch.float64), task, TuningSettings(thinning=thinning))
+    return held_out, next(iter(held_out.trials(filter, torch.arange(6), ~targets)))
+
+
+@pytest.mark.parametrize("make", [particle_filter, bip, made])
+def test_every_kind_of_filter_is_held_out_and_asked_for_the_targets_alone(
+    make: Callable[[InteractionPrimitive], InteractionFilter],
+) -> None:
+    """Also those that remember nothing of late; and forecasts are those of the whole filter."""
+    primitive = small_primitive(torch.float64)
+    held_out, trial = trial_of(make(primitive), primitive, 3)
+    objective, shown = held_out.task.objective, trial.shown
+    whole = objective.forecast(trial.filter, trial.trace.kept, shown.now).select(shown.targets)
+    torch.testing.assert_close(trial.forecast(objective).mean, whole.mean)
+    torch.testing.assert_close(trial.forecast(objective).variance, whole.variance)
+
+
+def test_a_thinned_interaction_knows_what_all_samples_showed_of_late() -> None:
+    primitive = small_primitive(torch.float64)
+    filter = made(primitive)
+    _, trial = trial_of(filter, primitive, 3)
+    steps = trial.shown.steps * 3
+    y, observed = (part[:6] for part in interactions(24, dtype=torch.float64).pad())
+    observed = observed & ~primitive.layout.controlled
+    expected = recent_sums(filter.analysis.recent, y, observed, steps, 1 / 30)
+    torch.testing.assert_close(trial.trace.kept.memory.recent, expected)

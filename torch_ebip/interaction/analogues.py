@@ -151,7 +151,7 @@ class Analogues(nn.Module):
         table = DemonstrationTable.of(primitive)
         compared = ~layout.controlled if compared is None else compared
         pace = primitive.phase_velocity
-        velocity = _slopes(table) * pace[:, None, None]
+        velocity = table.slopes * pace[:, None, None]
         scale = torch.stack([primitive.value_variance.clamp(min=0).sqrt(), velocity.flatten(0, 1).std(0)])
         return cls(table, pace, scale.to(weights), layout.modality_of_dof, compared)
 
@@ -168,8 +168,8 @@ class Analogues(nn.Module):
         return _Constants(*(outside_inference(part) for part in kept[1]))
 
     def _computed(self) -> _Constants:
-        values = _values(self.table)[..., self.dofs]
-        velocities = _slopes(self.table)[..., self.dofs] * self.pace[:, None, None]
+        values = self.table.values[..., self.dofs]
+        velocities = self.table.slopes[..., self.dofs] * self.pace[:, None, None]
         middle = torch.stack([values.mean((0, 1)), torch.zeros_like(values[0, 0])])
         moved = self.scale > 0
         inverse = torch.where(moved, 1 / torch.where(moved, self.scale, 1), 0)
@@ -284,15 +284,3 @@ def _reached(phase: Tensor, variance: Tensor, count: int) -> slice:
     if not (math.isfinite(low) and math.isfinite(high)):
         return slice(0, count)
     return slice(max(math.floor(low * (count - 1)), 0), min(math.ceil(high * (count - 1)), count - 1) + 1)
-
-
-def _values(table: DemonstrationTable) -> Tensor:
-    """[N, P, D], of a table's demonstrations at its phases, units of the DoFs."""
-    return torch.cat([table.cells[:, :, 0], table.cells[:, -1:].sum(2)], 1)
-
-
-def _slopes(table: DemonstrationTable) -> Tensor:
-    """[N, P, D], by phase."""
-    cells = table.cells
-    last = cells[:, -1:, 1] + 2 * cells[:, -1:, 2] + 3 * cells[:, -1:, 3]
-    return torch.cat([cells[:, :, 1], last], 1) * cells.shape[1]

@@ -13,6 +13,7 @@ from torch_ebip.common.draws import Generators
 from torch_ebip.filtering.base import EngineName, Filter
 from torch_ebip.filtering.protocols import MayLeaveSpan, View
 from torch_ebip.filtering.states import Memory, State
+from torch_ebip.filtering.updates.recent import Recent
 from torch_ebip.interaction.analogue_readout import AnalogueReadout
 from torch_ebip.interaction.attribution import affine_coefficients
 from torch_ebip.interaction.bounds import Bounds
@@ -171,7 +172,7 @@ class InteractionFilter(Filter):
         Raises:
             ValueError: a state without members, made by hand, or of an update that has no `Recent`.
         """
-        memory, recent = getattr(state, "memory", None), getattr(getattr(self, "analysis", None), "recent", None)
+        memory, recent = getattr(state, "memory", None), self.recent
         if memory is None or recent is None or memory.recent is None:
             raise ValueError("nobody remembers what was seen of late: the filter's update has no `Recent`")
         count = len(self.prior.states)  # type: ignore[arg-type]
@@ -189,6 +190,12 @@ class InteractionFilter(Filter):
         """What judges sensors and the interaction; None if nothing does."""
         found = getattr(getattr(self, "analysis", None), "surprise", None)
         return found if isinstance(found, InteractionSurprise) else None
+
+    @property
+    def recent(self) -> Recent | None:
+        """What remembers what was seen of late; None if nothing does."""
+        found = getattr(getattr(self, "analysis", None), "recent", None)
+        return found if isinstance(found, Recent) else None
 
     @eager
     def familiarity(self, state: State) -> Tensor:

@@ -77,6 +77,18 @@ class DemonstrationTable(nn.Module):
         """D."""
         return self.cells.shape[-1]
 
+    @property
+    def values(self) -> Tensor:
+        """[N, P, D], at the phases of the grid, units of the DoFs."""
+        return torch.cat([self.cells[:, :, 0], self.cells[:, -1:].sum(2)], 1)
+
+    @property
+    def slopes(self) -> Tensor:
+        """[N, P, D], at the phases of the grid, by phase."""
+        _, first, second, third = self.cells.unbind(-2)
+        last = (first + 2 * second + 3 * third)[:, -1:]
+        return torch.cat([first, last], 1) * self.cells.shape[1]
+
     def at(self, demonstrations: Tensor, phase: Tensor, dofs: Tensor | None = None) -> Tensor:
         """Where demonstrations are at some phases.
 
@@ -102,8 +114,8 @@ class DemonstrationTable(nn.Module):
         """Variance over the demonstrations at the phases of the grid, [P, k], squared units, of DoFs int64 [k]."""
         version = None if self.cells.is_inference() else self.cells._version
         if self._spread is None or version is None or self._spread[0] is not self.cells or self._spread[1] != version:
-            ends = torch.cat([self.cells[:, :, 0], self.cells[:, -1:].sum(2)], 1)
-            self._spread = self.cells, version, ends.var(0, correction=1 if len(ends) > 1 else 0)
+            values = self.values
+            self._spread = self.cells, version, values.var(0, correction=1 if len(values) > 1 else 0)
         spread = outside_inference(self._spread[2])
         return spread if dofs is None else spread[:, dofs]
 

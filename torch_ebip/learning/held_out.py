@@ -182,7 +182,7 @@ class HeldOut:
 
     def _seen_lately(self, shown: Shown, filter: InteractionFilter, trace: Trace) -> Trace:
         """The trace, its states knowing what all samples showed of late, not only those that thinning left."""
-        recent, kept, stride = getattr(filter.analysis, "recent", None), trace.kept, self.settings.thinning
+        recent, kept, stride = filter.recent, trace.kept, self.settings.thinning
         if recent is None or kept is None or stride == 1:
             return trace
         steps = shown.steps * stride

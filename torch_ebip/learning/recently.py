@@ -29,7 +29,6 @@ def recent_sums(
     sums = recent.start(y)
     found = sums.new_zeros(*steps.shape, *sums.shape[-2:])
     seconds = y.new_tensor(dt)
-    rows = torch.arange(len(y), device=y.device)
     nothing = y.new_zeros(1, 1)
     for t in range(int(steps.max()) + 1):
         if t:
@@ -38,5 +37,5 @@ def recent_sums(
         sums = recent.learn(sums, Seen(y[:, t], observed[:, t], believed, None, nothing, nothing[0], None))
         here = steps == t
         if bool(here.any()):
-            found = torch.where(here[..., None, None], sums[rows].unsqueeze(1), found)
+            found = torch.where(here[..., None, None], sums.unsqueeze(1), found)
     return found

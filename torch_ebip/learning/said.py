@@ -87,7 +87,7 @@ def what_it_says(
                     place,
                     mean / scale,
                     trial.filter.doubted(state),
-                    None if getattr(filter.analysis, "recent", None) is None else trial.filter.present(state),
+                    None if filter.recent is None else trial.filter.present(state),
                 )
             )
     gathered = held_out.ranks.gather([map_state(Tensor.cpu, part) for part in parts])
