@@ -91,6 +91,8 @@ def main(arguments: list[str] | None = None) -> None:
     if options.protocol == "moveint":
         moveint.run(options, arguments)
         return
+    if options.reference is not None and options.reference not in options.methods:
+        raise SystemExit(f"--reference {options.reference} must be one of --methods, got {' '.join(options.methods)}")
     began = time.monotonic()
     ranks = Ranks.start()
     tuning = TuningSettings(seed=options.seed, steps=options.steps)
@@ -163,7 +165,7 @@ def main(arguments: list[str] | None = None) -> None:
             "rate": demonstrations.rate,
             "folds": folds,
         },
-        **summarise(values),
+        **summarise(values, options.reference),
         **({} if options.data else {"paper": paper_rows()}),
         "seconds_by_method": seconds,
         "seconds": round(time.monotonic() - began, 1),
@@ -199,6 +201,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--protocol", choices=("folds", "moveint"), default="folds",
         help="how: cross-validation, or the protocol of MoVEInt, see experiments/moveint.py (default: folds)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--reference", choices=list(ALL), metavar="METHOD",
+        help="compare all others with this one of the methods (default: with the best of each cell)",
     )  # fmt: skip
     parser.add_argument("--members", type=int, metavar="E", help="of ensembles (default: N of the training part)")
     parser.add_argument(

@@ -12,6 +12,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from experiments.comparisons import LEVEL, compared, corrected, verdicts
+
 
 class Cell(NamedTuple):
     """What a value was measured on."""
@@ -25,6 +27,9 @@ class Cell(NamedTuple):
     """Seconds after the last sample that was shown; None: the end."""
 
 
+TEST = "Mann-Whitney U, Holm's p over the cells of a line"
+"""What decides on the marks of a table."""
+
 Values = dict[Cell, dict[str, NDArray[np.float64]]]
 """For each cell and method one value an interaction; NaN where there is none."""
 
@@ -32,10 +37,10 @@ Values = dict[Cell, dict[str, NDArray[np.float64]]]
 def summarise(values: Values, reference: str | None = None) -> dict[str, Any]:
     """``rows``, ``comparisons`` and ``summary``, means over the cells.
 
-    Comparisons are two-sided Mann-Whitney U tests, as in the paper: of every method with the reference; without
-    one, with the best method of each cell.
+    Comparisons are of every method with the reference; without one, with the best method of each cell, see
+    `experiments.comparisons`.
     """
-    rows, comparisons = [], []
+    rows, comparisons = [], list[dict[str, Any]]()
     for cell, methods in values.items():
         key = {"subset": cell.subset, "observed": cell.observed, "metric": cell.metric, "modality": cell.modality}
         key |= {} if cell.ahead is None else {"ahead": cell.ahead}
@@ -45,16 +50,14 @@ def summarise(values: Values, reference: str | None = None) -> dict[str, Any]:
             error = float(array.std(ddof=1) / math.sqrt(len(array))) if len(array) > 1 else None
             statistics = {"mean": float(array.mean()), "standard_error": error, "n": len(array)}
             rows.append({"method": name, **key, "unit": cell.unit, **statistics})
-        from scipy.stats import mannwhitneyu  # half a second that no process without a table should wait for
-
         against = reference
         if against is None and measured:
             against = min(measured, key=lambda name: _badness(cell.metric, float(measured[name].mean())))
-        for name, array in measured.items():
-            if name != against and against in measured:
-                p_value = float(mannwhitneyu(measured[against], array).pvalue)
-                comparisons.append({**key, "a": against, "b": name, "p_value": p_value})
-    return {"rows": rows, "comparisons": comparisons, "summary": _over_cells(rows), "reference": reference}
+        if against in measured:
+            tests = compared({name: methods[name] for name in measured}, against)
+            comparisons += [{**key, **test} for test in tests]
+    results = {"rows": rows, "comparisons": corrected(comparisons), "summary": _over_cells(rows)}
+    return results | {"reference": reference}
 
 
 def _over_cells(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -93,14 +96,14 @@ class Grid(NamedTuple):
 def grids(results: Mapping[str, Any], only: Sequence[tuple[str, str | None]] | None = None) -> list[Grid]:
     """A table for each metric and modality, or for ``only`` some of these pairs.
 
-    With a reference, ``*`` marks what differs from it with p < 0.05; without, ``°`` marks what is not
-    significantly worse than the best of the cell.
+    With a reference, ``*`` marks what differs from it; without, ``°`` marks what is not significantly worse than
+    the best of the cell; corrected for the cells of the table, see `experiments.comparisons`.
     """
     rows, made = results["rows"], []
     differing = {
         (c["subset"], c["observed"], c["metric"], c["modality"], c.get("ahead"), c["b"])
         for c in results["comparisons"]
-        if c["p_value"] < 0.05
+        if c["p_holm"] < LEVEL
     }
     kinds = dict.fromkeys((row["metric"], row["modality"], row["unit"], row.get("ahead")) for row in rows)
     for metric, modality, unit, ahead in kinds:
@@ -187,6 +190,23 @@ def horizon_grids(results: Mapping[str, Any], only: Sequence[tuple[str, str | No
     return made
 
 
+def verdict_grids(results: Mapping[str, Any], only: Sequence[tuple[str, str | None]] | None = None) -> list[Grid]:
+    """Of a reference, in how many cells it is better and worse than each other method: a column a table."""
+    rows = [row for row in verdicts(results) if only is None or (row["metric"], row["modality"]) in only]
+    columns = list(dict.fromkeys((row["metric"], row["modality"], row["ahead"]) for row in rows))
+    lines: dict[str, list[tuple[str, bool]]] = {}
+    for row in rows:
+        line = lines.setdefault(row["method"], [("-", False)] * len(columns))
+        text = f"{row['better']} / {row['worse']} of {row['cells']}, p {row['p_worse']:.2g}"
+        line[columns.index((row["metric"], row["modality"], row["ahead"]))] = text, False
+    heads = [
+        " ".join(part for part in (metric, modality) if part) + ("" if ahead is None else f"\n{ahead:g} s")
+        for metric, modality, ahead in columns
+    ]
+    title = f"{results['reference']}: cells better / worse (Holm's p < {LEVEL}), smallest p of one that is worse"
+    return [Grid(title, heads, lines)] if lines else []
+
+
 def _unit(unit: str, rows: Sequence[Mapping[str, Any]]) -> tuple[float, str]:
     """Factor and name: millimetres where all is below a decimetre, as people speak of it."""
     return (1e3, "mm") if unit == "m" and max(row["mean"] for row in rows) < 0.1 else (1.0, unit)
@@ -196,8 +216,8 @@ def legend(results: Mapping[str, Any]) -> str:
     """What the marks in the tables mean."""
     reference = results["reference"]
     if reference is None:
-        return "bold: best of the cell; °: not significantly worse (Mann-Whitney U, p >= 0.05); ±: standard error"
-    return f"bold: best; *: differs from {reference} (Mann-Whitney U, p < 0.05); ±: standard error"
+        return f"bold: best of the cell; °: not significantly worse ({TEST} >= {LEVEL}); ±: standard error"
+    return f"bold: best; *: differs from {reference} ({TEST} < {LEVEL}); ±: standard error"
 
 
 def _badness(metric: str, mean: float) -> float:
@@ -213,7 +233,7 @@ def print_tables(
     console = Console() if console is None else console
     if not console.is_terminal:
         console.width = max(console.width, 160)
-    for grid in (*grids(results, only), *horizon_grids(results, only)):
+    for grid in (*grids(results, only), *horizon_grids(results, only), *verdict_grids(results, only)):
         table = Table(title=escape(grid.title), title_justify="left")
         table.add_column("method")
         for column in grid.columns:
@@ -232,7 +252,7 @@ def _cell(text: str) -> str:
 def markdown(results: Mapping[str, Any]) -> str:
     """Every table of the results in Markdown."""
     parts = []
-    for grid in (*horizon_grids(results), *grids(results)):
+    for grid in (*horizon_grids(results), *grids(results), *verdict_grids(results)):
         heads = ["method", *(_cell(column.replace("\n", " ")) for column in grid.columns)]
         lines = [f"**{grid.title}**", "", f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}"]
         for method, cells in grid.lines.items():

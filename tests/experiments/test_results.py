@@ -3,9 +3,10 @@ import io
 import numpy as np
 import pytest
 from rich.console import Console
-from scipy.stats import mannwhitneyu
+from scipy.stats import mannwhitneyu, wilcoxon
 
-from experiments.results import Cell, print_tables, summarise
+from experiments.comparisons import holm, verdicts
+from experiments.results import Cell, markdown, print_tables, summarise
 
 GENERATOR = np.random.default_rng(0)
 CELLS = [Cell("ball", 0.82, "mae", "robot", "rad"), Cell("all", 0.43, "mae", "robot", "rad")]
@@ -24,7 +25,8 @@ def test_rows_follow_the_contract() -> None:
     assert row["mean"] == pytest.approx(sample.mean())
     assert row["standard_error"] == pytest.approx(sample.std(ddof=1) / np.sqrt(40))
     comparison = results["comparisons"][0]
-    assert set(comparison) == {"subset", "observed", "metric", "modality", "a", "b", "p_value"}
+    tests = {"p_value", "p_holm", "p_paired", "p_paired_holm"}
+    assert set(comparison) == {"subset", "observed", "metric", "modality", "a", "b"} | tests
     assert comparison["p_value"] == pytest.approx(mannwhitneyu(VALUES[CELLS[0]]["ebip_tuned"], sample).pvalue)
     means = [r["mean"] for r in results["rows"] if r["method"] == "mean"]
     summary = next(s for s in results["summary"] if s["method"] == "mean")
@@ -46,3 +48,30 @@ def test_the_table_shows_what_the_results_say() -> None:
     assert "mae robot" in text
     assert "82%" in text
     assert "*" in text
+
+
+def test_holms_correction() -> None:
+    """A worked example (Holm 1979 has none; Aickin & Gensler 1996, Table 1), and what it promises."""
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([]) == []
+    assert holm([0.9, 0.8]) == [1.0, 1.0]
+    false_alarms = [min(holm(p)) < 0.05 for p in np.random.default_rng(1).random((4000, 27)).tolist()]
+    assert np.mean(false_alarms) == pytest.approx(0.05, abs=0.012)
+
+
+def test_a_reference_is_told_where_it_is_worse() -> None:
+    """Better in one cell, worse in another, and in a third, where chance alone speaks, neither."""
+    generator = np.random.default_rng(3)
+    cells = [Cell(subset, 0.82, "mae", "ball", "m") for subset in ("better", "worse", "same")]
+    values = {}
+    for cell, step in zip(cells, (0.3, -0.3, 0.0), strict=True):
+        hard = generator.normal(5, 3, 60)  # what is hard for one is hard for all: only pairs tell
+        values[cell] = {"a": hard, "b": hard + step + generator.normal(0, 0.3, 60)}
+    results = summarise(values, "a")
+    (verdict,) = verdicts(results)
+    assert (verdict["method"], verdict["cells"], verdict["better"], verdict["worse"]) == ("b", 3, 1, 1)
+    paired = [wilcoxon(values[cell]["a"] - values[cell]["b"]).pvalue for cell in cells]
+    assert [c["p_paired"] for c in results["comparisons"]] == pytest.approx(paired)
+    assert verdict["p_worse"] == pytest.approx(3 * paired[1]) or verdict["p_worse"] == pytest.approx(2 * paired[1])
+    assert "1 / 1 of 3, p " in markdown(results)
+    assert verdicts(summarise(values)) == []
