@@ -121,11 +121,12 @@ class AnalogueReadout(nn.Module):
         theirs, spread = self.analogues.forecast(self.analogues(present), lead)
         at = horizon_hats(lead, self.seconds)  # [..., P, K]
         both = torch.cat([forecast.mean - theirs, theirs - mean], -1)
-        every = torch.einsum("...j,kij->...ki", both, torch.cat([self.follow, self.correct], -1))
-        stacked = theirs + (at.unsqueeze(-1) * every).sum(-2)
+        K, D, _ = self.width.shape
+        every = (both @ torch.cat([self.follow, self.correct], -1).view(K * D, 2 * D).T).view(*at.shape, D)
+        stacked = theirs + (at.unsqueeze(-2) @ every).squeeze(-2)
         widths = widths_of(forecast, variance)
         of_each = torch.stack([widths.own, root(spread), widths.demonstrated], -1)
-        deviation = (torch.einsum("...k,kdv->...dv", at, self.width) * of_each).sum(-1)
+        deviation = ((at @ self.width.flatten(1)).view_as(of_each) * of_each).sum(-1)
         return moved(forecast, stacked, deviation, torch.ones_like(deviation), widths)
 
     def together(self, dofs: Tensor) -> Tensor:

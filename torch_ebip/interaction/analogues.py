@@ -228,7 +228,7 @@ class Analogues(nn.Module):
     def _seen(self, line: Line, constants: _Constants) -> tuple[Tensor, Tensor]:
         """x and c [R, 2, k] of lines."""
         belief = line.belief
-        parts = torch.stack([line.value, line.velocity, belief, belief * line.moves], -2)[..., self.dofs]
+        parts = torch.stack([line.value, line.velocity, belief, belief * line.moves], -2).index_select(-1, self.dofs)
         x = ((parts[..., :2, :] - constants.middle) * constants.inverse).clamp(-FAR, FAR)
         here = parts[..., 2:, :] * constants.moved
         total, squares = here @ constants.sensors, here.square() @ constants.sensors

@@ -9,6 +9,7 @@ from torch_ebip.common.ambient import eager
 from torch_ebip.filtering import functional
 from torch_ebip.filtering.ensemble import EnsembleFilter
 from torch_ebip.filtering.extended import ExtendedFilter, GaussianState
+from torch_ebip.filtering.functional.moments import centred, member_shares
 from torch_ebip.filtering.members import MemberFilter
 from torch_ebip.filtering.particle import ParticleFilter
 from torch_ebip.filtering.states import State
@@ -49,23 +50,25 @@ class InteractionMemberFilter(InteractionFilter, MemberFilter):
         # A member that runs backwards, of a hand that goes back, waits: it has no end to come to.
         phase = now + velocity.clamp(min=0) * torch.where(end, 0, ahead.unsqueeze(-1))
         phase = torch.where(end, 1, phase).clamp(max=1)
-        departures = basis.project(phase, members[..., m:].unsqueeze(-3))
         weights = None if state.weights is None else state.weights.unsqueeze(-2)
-        mean = functional.ensemble_mean(phase.unsqueeze(-1), weights).squeeze(-1)
-        centre, path = self._centre(state), None
-        if centre is not None:
+        mean = functional.ensemble_mean(phase.unsqueeze(-1), weights)
+        centre = self._centre(state)
+        if centre is None:
+            departures, path = basis.project(phase, members[..., m:].unsqueeze(-3)), None
+        else:
             # Members differ by where they are along the centre's path, too.
-            still = centre[..., m:].unsqueeze(-2)
-            path = basis.project(mean, still).unsqueeze(-2)
-            departures = departures + (basis.project(phase, still.unsqueeze(-2)) - path)
-        return self._of_members(state, mean, departures, path)
+            phases = torch.cat([phase, mean], -1)
+            departures, along = basis.project_apart(phases, members[..., m:], centre[..., m:])
+            along, path = along[..., :-1, :], along[..., -1:, :]
+            departures = departures + (along - path)
+        return self._of_members(state, mean.squeeze(-1), departures, path)
 
     def _of_members(self, state: State, phase: Tensor, departures: Tensor, path: Tensor | None) -> Forecast:
         """The forecast of members that differ by ``departures`` from a path that they share."""
         weights = None if state.weights is None else state.weights.unsqueeze(-2).expand(departures.shape[:-1])
-        mean = functional.ensemble_mean(departures, weights)
-        variance = functional.ensemble_variance(departures, weights, self.fair)
-        members = departures
+        apart = centred(departures, weights)
+        mean, members = apart.reference + apart.shift, departures
+        variance = (apart.anomalies.square() * member_shares(departures, weights, self.fair)).sum(-2)
         if path is not None:
             mean, members = mean + path.squeeze(-2), departures + path
         return Forecast(mean, variance, phase, members, weights, self.fair)

@@ -90,11 +90,10 @@ def hats(lead: Tensor, leads: Tensor) -> Tensor:
     """Weights [..., K] of linear interpolation between leads [K], increasing, at a lead [...] within them."""
     if len(leads) == 1:
         return leads.new_ones(*lead.shape, 1)
-    right = torch.searchsorted(leads, lead.contiguous(), right=True).clamp(1, len(leads) - 1)
-    left = right - 1
-    part = ((lead - leads[left]) / (leads[right] - leads[left])).unsqueeze(-1)
-    one = torch.nn.functional.one_hot
-    return one(left, len(leads)) * (1 - part) + one(right, len(leads)) * part
+    # Of each interval the part that was gone: 1 up to the one where the lead is, 0 from there on.
+    part = ((lead.unsqueeze(-1) - leads[:-1]) / leads.diff()).clamp(0, 1)
+    end = torch.zeros_like(part[..., :1])
+    return torch.cat([end + 1, part], -1) - torch.cat([part, end], -1)
 
 
 def widths_of(forecast: Forecast, variance: Tensor) -> Widths:

@@ -33,9 +33,13 @@ class Basis(nn.Module, ABC):
     def evaluate(self, phase: Tensor) -> tuple[Tensor, Tensor]:
         """Values and slopes d/dphi, [..., n_features] each, at phases [...] within [0, 1]."""
 
+    def within(self, phase: Tensor) -> Tensor:
+        """`forward` at phases [...] known to lie within [0, 1]: what happens outside need not be looked at."""
+        return self.evaluate(phase)[0]
+
     def by_function(self, phase: Tensor) -> Tensor:
         """`forward` the other way round, [..., n_features, E], at phases [..., E] known to lie within [0, 1]."""
-        return self.evaluate(phase)[0].transpose(-1, -2).contiguous()
+        return self.within(phase).transpose(-1, -2).contiguous()
 
     def forward(self, phase: Tensor) -> Tensor:
         """Features [..., n_features] at phases [...] (any real number)."""

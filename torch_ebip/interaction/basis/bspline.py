@@ -40,20 +40,33 @@ class BSplineBasis(Basis):
         phases = (torch.arange(pieces, dtype=torch.float64, device="cpu")[:, None] + points) / pieces
         vandermonde = points[:, None] ** torch.arange(degree + 1, device="cpu")
         values = _cox_de_boor(phases, n_features, degree)
-        self.register_buffer("pieces", owned(torch.linalg.solve(vandermonde, values)), persistent=False)
+        self.register_buffer("pieces", owned(torch.linalg.solve(vandermonde, values).contiguous()), persistent=False)
 
     def evaluate(self, phase: Tensor) -> tuple[Tensor, Tensor]:
         """Values and slopes, from the polynomial pieces; see `Basis.evaluate`."""
+        coefficients, local = self._pieces_at(phase)
+        values, slopes = coefficients[..., -1, :], None
+        for k in range(self.degree - 1, -1, -1):  # Horner's scheme, for the value and its derivative
+            slopes = values if slopes is None else slopes * local + values
+            values = values * local + coefficients[..., k, :]
+        slopes = torch.zeros_like(values) if slopes is None else slopes
+        return values, slopes * (self.n_features - self.degree)
+
+    def within(self, phase: Tensor) -> Tensor:
+        """See `Basis.within`: without the slopes."""
+        coefficients, local = self._pieces_at(phase)
+        values = coefficients[..., -1, :]
+        for k in range(self.degree - 1, -1, -1):
+            values = values * local + coefficients[..., k, :]
+        return values
+
+    def _pieces_at(self, phase: Tensor) -> tuple[Tensor, Tensor]:
+        """Coefficients [..., degree + 1, n_features] at phases [...], and the local coordinates [..., 1] there."""
         pieces = self.n_features - self.degree
         scaled = phase * pieces
-        piece = scaled.detach().floor().long().clamp(0, pieces - 1)
-        local = (scaled - piece).unsqueeze(-1)
-        coefficients = self.pieces.to(phase)[piece]
-        values, slopes = coefficients[..., -1, :], torch.zeros_like(coefficients[..., -1, :])
-        for k in range(self.degree - 1, -1, -1):  # Horner's scheme, for the value and its derivative
-            slopes = slopes * local + values
-            values = values * local + coefficients[..., k, :]
-        return values, slopes * pieces
+        piece = scaled.detach().floor().clamp(0, pieces - 1)
+        found = self.pieces.to(phase).index_select(0, piece.long().reshape(-1))
+        return found.view(*phase.shape, *found.shape[1:]), (scaled - piece).unsqueeze(-1)
 
     def settings(self) -> dict[str, int | float | bool]:
         """See `Basis.settings`."""

@@ -64,6 +64,12 @@ class CentredBasis(Basis):
             return torch.cat([values, one], dim=-1), torch.cat([slopes, torch.zeros_like(one)], dim=-1)
         return values, slopes
 
+    def within(self, phase: Tensor) -> Tensor:
+        """See `Basis.within`: without the slopes."""
+        steepness, offsets = self._line(phase)
+        values = self.curve(torch.addcmul(offsets, phase.unsqueeze(-1), steepness))
+        return torch.cat([values, torch.ones_like(values[..., :1])], dim=-1) if self.offset else values
+
     def by_function(self, phase: Tensor) -> Tensor:
         """See `Basis.by_function`."""
         steepness, offsets = self._line(phase)

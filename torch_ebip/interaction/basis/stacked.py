@@ -112,6 +112,30 @@ class StackedBasis(nn.Module):
         return projections if centre is None else projections + self._paths(features, centre, dofs)
 
     @without_autocast
+    def project_apart(self, phase: Tensor, weights: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
+        """h(phi, w) of E sets of weights at P phases each, and of their centre at those and at others.
+
+        Args:
+            phase: [..., P, E + others]: those of the sets first.
+            weights: [..., E, n_weights], of which the ``centre`` was taken off.
+            centre: [..., n_weights].
+
+        Returns:
+            [..., P, E, D] and [..., P, E + others, D], units of the DoFs: h of a whole set is their sum.
+        """
+        low, high = torch.aminmax(phase.detach())
+        inside = float(low) >= 0 and float(high) <= 1
+        features = [basis.within(phase) if inside else basis(phase) for basis in self.families]
+        E = weights.shape[-2]
+        by_member = [each[..., :E, :].movedim(-3, -1) for each in features]  # one product a member, of all its phases
+        parts = [
+            (_select(block, run, run.wanted(None)) @ by_member[run.basis]).movedim(-1, -3)
+            for run, block in zip(self._runs, self._blocks(weights), strict=True)
+        ]
+        own = torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0]
+        return own, self._paths(features, centre.unsqueeze(-2), None)
+
+    @without_autocast
     def project_derivative(self, phase: Tensor, weights: Tensor) -> Tensor:
         """dh/dphi, shapes as `project`: the first column of the paper's Jacobian (equation of H_t)."""
         return self._project([basis.derivative(phase) for basis in self.families], weights, None)
@@ -210,7 +234,8 @@ class StackedBasis(nn.Module):
         parts = []
         for run, block in zip(self._runs, blocks, strict=True):
             functions = features[run.basis]
-            parts.append(torch.einsum("...pa,...kab,...pb->...pk", functions, block, functions))
+            towards = functions.unsqueeze(-3) @ block  # [..., k, P, B]
+            parts.append((towards * functions.unsqueeze(-3)).sum(-1).transpose(-1, -2))
         return torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0]
 
     def _paths(self, features: Sequence[Tensor], weights: Tensor, dofs: Sequence[int] | None) -> Tensor:
