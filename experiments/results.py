@@ -96,15 +96,19 @@ class Grid(NamedTuple):
 def grids(results: Mapping[str, Any], only: Sequence[tuple[str, str | None]] | None = None) -> list[Grid]:
     """A table for each metric and modality, or for ``only`` some of these pairs.
 
-    With a reference, ``*`` marks what differs from it; without, ``°`` marks what is not significantly worse than
-    the best of the cell; corrected for the cells of the table, see `experiments.comparisons`.
+    With a reference, ``*`` marks what differs from it, and ``†`` what does when interactions are compared in pairs;
+    without, ``°`` marks what is not significantly worse than the best of the cell. Corrected for the cells of the
+    table, see `experiments.comparisons`.
     """
     rows, made = results["rows"], []
-    differing = {
-        (c["subset"], c["observed"], c["metric"], c["modality"], c.get("ahead"), c["b"])
-        for c in results["comparisons"]
-        if c["p_holm"] < LEVEL
-    }
+    differing, in_pairs = (
+        {
+            (c["subset"], c["observed"], c["metric"], c["modality"], c.get("ahead"), c["b"])
+            for c in results["comparisons"]
+            if c[p] < LEVEL
+        }
+        for p in ("p_holm", "p_paired_holm")
+    )
     kinds = dict.fromkeys((row["metric"], row["modality"], row["unit"], row.get("ahead")) for row in rows)
     for metric, modality, unit, ahead in kinds:
         if only is not None and ((metric, modality) not in only or ahead is not None):
@@ -138,7 +142,7 @@ def grids(results: Mapping[str, Any], only: Sequence[tuple[str, str | None]] | N
                 if results["reference"] is None:
                     text += "" if differs or first else "°"
                 else:
-                    text += "*" if differs else ""
+                    text += "*" if differs else "†" if (*column, *kind, method) in in_pairs else ""
                 cells.append((text, first))
             mean = next(
                 s
@@ -217,7 +221,8 @@ def legend(results: Mapping[str, Any]) -> str:
     reference = results["reference"]
     if reference is None:
         return f"bold: best of the cell; °: not significantly worse ({TEST} >= {LEVEL}); ±: standard error"
-    return f"bold: best; *: differs from {reference} ({TEST} < {LEVEL}); ±: standard error"
+    pairs = "†: only in pairs, Wilcoxon's signed ranks"
+    return f"bold: best; *: differs from {reference} ({TEST} < {LEVEL}); {pairs}; ±: standard error"
 
 
 def _badness(metric: str, mean: float) -> float:

@@ -73,5 +73,8 @@ def test_a_reference_is_told_where_it_is_worse() -> None:
     paired = [wilcoxon(values[cell]["a"] - values[cell]["b"]).pvalue for cell in cells]
     assert [c["p_paired"] for c in results["comparisons"]] == pytest.approx(paired)
     assert verdict["p_worse"] == pytest.approx(3 * paired[1]) or verdict["p_worse"] == pytest.approx(2 * paired[1])
-    assert "1 / 1 of 3, p " in markdown(results)
+    text = markdown(results)
+    assert "1 / 1 of 3, p " in text
+    (line,) = (line for line in text.splitlines() if line.startswith("| `b`") and "±" in line)
+    assert ["†" in cell for cell in line.split("|")[2:5]] == [True, True, False]
     assert verdicts(summarise(values)) == []
