@@ -115,6 +115,8 @@ READOUTS: dict[str, Callable[[Fold], FilterMethod | UnseenMethod]] = {
     "readout_no_memory": partial(_method, partial(with_readout, makes=Forgetful.of)),
     "readout_no_phase": partial(_method, partial(with_readout, makes=Timeless.of)),
     "readout_unseen": UnseenMethod,
+    "readout_again": partial(_method, partial(with_readout, makes=_analogues)),
 }
 """Builders: drawn towards the mean alone; analogues without the filter; without the evidence; without the filter's
-phase; learned without the set of sensors that is asked about."""
+phase; learned without the set of sensors that is asked about; as it is, learned anew, of a filter that was learned
+before."""

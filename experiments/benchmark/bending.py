@@ -10,7 +10,7 @@ import torch
 from experiments.surprise.reaches import reaches
 from experiments.timing import interleaved, threads
 from torch_ebip import AnalogueReadout, Analogues, InteractionPrimitive, LiveFilter, ebip
-from torch_ebip.interaction.horizons import SECONDS
+from torch_ebip.interaction.horizons import LEVELS, SECONDS
 from torch_ebip.interaction.present import recent_of
 
 
@@ -48,8 +48,9 @@ def _live(primitive: InteractionPrimitive, bends: bool, observed: torch.Tensor, 
     if bends:
         D, K = primitive.layout.n_dofs, len(SECONDS)
         half = 0.5 * torch.eye(D).repeat(K, 1, 1)
+        follow, width = half.repeat(1, 1, len(LEVELS)), torch.ones(K, D, 3) / 3
         filter.analysis.recent = recent_of(primitive)
-        filter.readout = AnalogueReadout(Analogues.of(primitive), half, 0.1 * half, torch.ones(K, D, 3) / 3)
+        filter.readout = AnalogueReadout(Analogues.of(primitive), follow, 0.1 * half, width, levels=LEVELS)
     live = LiveFilter(filter, observed, generator=torch.Generator().manual_seed(seed))
     for step, sample in enumerate(path[: len(path) // 2]):
         if step:

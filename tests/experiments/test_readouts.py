@@ -13,6 +13,7 @@ from tests.conftest import interactions, small_primitive
 from tests.interaction.test_analogues import present_of
 from torch_ebip import TuningSettings
 from torch_ebip.interaction import AnalogueReadout, Analogues
+from torch_ebip.interaction.horizons import LEVELS
 
 TASK = Task({"hand": ["hand"], "both": ["hand", "gaze"]}, (0.5, 0.8), [], ["arm"], {}, None, (0.25,))
 
@@ -44,12 +45,16 @@ def test_all_of_them_answer(fold: Fold) -> None:
     assert not isinstance(with_readout(fold, None).readout, AnalogueReadout)
     alone = with_readout(fold, Analogues.of, alone=True).readout
     targets = model.layout.controlled
-    assert alone.follow[:, targets][:, :, targets].abs().max() == 0
-    assert torch.equal(alone.follow[:, ~targets][:, :, ~targets], torch.eye(3).expand(5, -1, -1))
+    for follow in alone.follow.unflatten(-1, (len(LEVELS), -1)).unbind(2):
+        assert follow[:, targets][:, :, targets].abs().max() == 0
+        assert torch.equal(follow[:, ~targets][:, :, ~targets], torch.eye(3).expand(5, -1, -1))
     methods = {name: build(fold) for name, build in READOUTS.items()}
     values = evaluate(TASK, methods, interactions(6, seed=9))
     errors = [each for cell, each in values.items() if cell.metric == "mae"]
     said = {name: sum(float(np.nanmean(each[name])) for each in errors) for name in methods}
+    # Nobody weighs members here, so that forgetting their weights changes nothing.
+    assert model.filter.analysis.weighting is None
+    assert said.pop("readout_again") == said["readout_no_memory"]
     assert len({round(v, 6) for v in said.values()}) == len(said)
     assert all(0 < v < 20 for v in said.values())
 

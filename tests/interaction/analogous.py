@@ -8,6 +8,7 @@ from torch_ebip import InteractionPrimitive, ebip
 from torch_ebip.interaction import InteractionEnsembleFilter
 from torch_ebip.interaction.analogue_readout import AnalogueReadout
 from torch_ebip.interaction.analogues import Analogues
+from torch_ebip.interaction.horizons import LEVELS
 from torch_ebip.interaction.present import recent_of
 
 
@@ -16,15 +17,18 @@ def bent(primitive: InteractionPrimitive, **options: object) -> InteractionEnsem
     filter = ebip(primitive, **options)  # type: ignore[arg-type]
     filter.analysis.recent = recent_of(primitive)
     like, D, draws = primitive.weights, primitive.layout.n_dofs, torch.Generator().manual_seed(0)
-    follow, correct = torch.eye(D).repeat(5, 1, 1), torch.zeros(5, D, D)
+    follow, correct = torch.eye(D).repeat(5, len(LEVELS), 1, 1), torch.zeros(5, D, D)
     controlled = primitive.layout.controlled.nonzero().squeeze(-1)
     n = len(controlled)
-    follow[:, controlled.unsqueeze(-1), controlled] = 0.3 * torch.randn(5, n, n, generator=draws) + 0.3 * torch.eye(n)
+    for j in range(len(LEVELS)):
+        random = 0.3 * torch.randn(5, n, n, generator=draws)
+        follow[:, j, controlled.unsqueeze(-1), controlled] = random + 0.3 * torch.eye(n)
     correct[:, controlled.unsqueeze(-1), controlled] = 0.1 * torch.randn(5, n, n, generator=draws)
     width = torch.rand(5, D, 3, generator=draws)
     analogues = Analogues.of(primitive)
     with torch.no_grad():
         for parameter in analogues.parameters():
             parameter.add_(0.3 * torch.randn(parameter.shape, generator=draws).to(parameter))
-    filter.readout = AnalogueReadout(analogues, *(part.to(like) for part in (follow, correct, width)))
+    parts = (follow.transpose(1, 2).flatten(-2), correct, width)
+    filter.readout = AnalogueReadout(analogues, *(part.to(like) for part in parts), levels=LEVELS)
     return filter

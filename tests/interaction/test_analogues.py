@@ -157,10 +157,10 @@ def test_units_and_places_change_nothing() -> None:
     for each in (known, moved):
         primitive = InteractionPrimitive.fit(each, small_primitive().basis)
         filter = bent(primitive, weigh=True, square_root=True)
-        for name in ("follow", "correct"):
-            matrix = getattr(filter.readout, name)
-            if each is moved:
-                matrix.mul_(factor.unsqueeze(-1) / factor)
+        if each is moved:
+            ratio = factor.unsqueeze(-1) / factor
+            filter.readout.follow.mul_(ratio.repeat(1, len(filter.readout.levels)))
+            filter.readout.correct.mul_(ratio)
         y, observed = (part[0, :20] for part in each.pad())
         trace = filter(y, observed & ~each.layout.controlled, generator=torch.Generator().manual_seed(0))
         said.append(filter.forecast(trace.state, ahead=[0.2, END]))
@@ -234,19 +234,25 @@ def test_the_forecast_is_put_together_as_it_is_written() -> None:
     y, observed = (part[:2, :20] for part in interactions(2, seed=7, dtype=torch.float64).pad())
     state = filter(y, observed & ~primitive.layout.controlled, generator=torch.Generator().manual_seed(0)).state
     readout, ahead = filter.readout, torch.tensor([0.1, 0.375, END]).double()
+    places = [0.005, 0.03, 0.12]  # it is surer than filters that are tuned
+    readout.levels.copy_(torch.tensor(places))
     said = filter.forecast(state, ahead=ahead)
     filter.readout = None
     alone = filter.forecast(state, ahead=ahead)
     lead = filter.lead(state, alone.phase, ahead)
     mean, variance = filter.demonstrated(lead.phase)
     theirs, spread = readout.analogues.forecast(readout.analogues(filter.present(state)), lead)
-    B, C, width = readout.follow, readout.correct, readout.width
+    B, C, width = readout.follow.unflatten(-1, (3, 5)).transpose(1, 2), readout.correct, readout.width
+    sure = np.sqrt((alone.variance / variance).detach().numpy())  # by DoF
+    levels = torch.tensor(np.stack([np.interp(sure, places, row) for row in np.eye(3)], -2))  # [2, 3, J, D]
+    assert 0.1 < float(levels[..., 1, :].mean()) < 0.9
     for p, (first, second) in enumerate(((0, 0), (1, 2), (4, 4))):
         seconds = lead.seconds[:, p]
         assert p == 2 or float((seconds - ahead[p]).abs().max()) < 1e-6
         b, c, w = ((m[first] + m[second]) / 2 for m in (B, C, width))
         f, h, m = alone.mean[:, p], theirs[:, p], mean[:, p]
-        torch.testing.assert_close(said.mean[:, p], h + (f - h) @ b.T + (h - m) @ c.T)
+        followed = sum((levels[:, p, j] * (f - h)) @ b[j].T for j in range(3))
+        torch.testing.assert_close(said.mean[:, p], h + followed + (h - m) @ c.T)
         deviation = torch.stack([alone.variance[:, p].sqrt(), spread[:, p].sqrt(), variance[:, p].sqrt()], -1)
         torch.testing.assert_close(said.variance[:, p].sqrt(), (w * deviation).sum(-1))
     moments = (said.weights.unsqueeze(-1) * said.members).sum(-2)
@@ -316,6 +322,10 @@ def test_what_does_not_fit_is_named() -> None:
         AnalogueReadout(analogues, torch.eye(5), eye, width)
     with pytest.raises(ValueError, match="width must not be negative"):
         AnalogueReadout(analogues, eye, eye, -width)
+    with pytest.raises(ValueError, match=r"levels must increase from 0 or more, got \[0.5, 0.5\]"):
+        AnalogueReadout(analogues, eye.repeat(1, 1, 2), eye, width, levels=[0.5, 0.5])
+    with pytest.raises(ValueError, match=r"follow must be \[5, 5, 10\] and finite, got \[5, 5, 5\]"):
+        AnalogueReadout(analogues, eye, eye, width, levels=[0.5, 1.0])
     with pytest.raises(ValueError, match="seconds must increase"):
         AnalogueReadout(analogues, eye, eye, width, [0.5, 0.1, 0.2, 0.3, END])
     with pytest.raises(ValueError, match="no DoF is compared"):

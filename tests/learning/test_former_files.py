@@ -2,7 +2,8 @@
 
 Each in `former/` is a small model as a commit of before saved it, beside recorded values and what it forecast of
 them: the first version of the format, evidence with one memory, with two whose sharpness could only grow,
-surprise that did not ask for a direction and surprise that did, and forecasts without analogues.
+surprise that did not ask for a direction and surprise that did, forecasts without analogues, and analogues that
+followed the filter alike however sure it was.
 """
 
 from pathlib import Path
@@ -14,7 +15,7 @@ import torch
 from torch_ebip.learning import InteractionModel
 
 FORMER = Path(__file__).parent / "former"
-NAMES = ["first", "one_memory", "two_memories", "surprise", "direction"]
+NAMES = ["first", "one_memory", "two_memories", "surprise", "direction", "analogues"]
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -4,6 +4,8 @@ Two voices that err differently say more together than the better one (Wolpert 1
 one says of a DoF tells of others, too: where the filter sees the elbow elsewhere than analogues do, the wrist will be
 elsewhere. So the correction is a matrix over the DoFs of a modality (Breiman & Friedman 1997), for each horizon, and
 the same whatever sensors there are: what those tell is in the weights of analogues and in the filter's gain already.
+Where a DoF is seen the filter knows of the next moment what no demonstration does, and where it is not, little: so it
+is followed by how sure it is, as a share of how far demonstrations lie apart.
 """
 
 from __future__ import annotations
@@ -14,36 +16,38 @@ import torch
 from torch import Tensor, nn
 
 from torch_ebip.common.ambient import owned
-from torch_ebip.common.arguments import as_values
 from torch_ebip.common.modules import sharing
 from torch_ebip.filtering.protocols import View
 from torch_ebip.interaction.analogues import Analogues
 from torch_ebip.interaction.forecast import Forecast
-from torch_ebip.interaction.horizons import SECONDS, horizon_hats
+from torch_ebip.interaction.horizons import SECONDS, horizon_hats, level_hats
 from torch_ebip.interaction.present import Present
-from torch_ebip.interaction.readout import Lead, moved, root, widths_of
+from torch_ebip.interaction.readout import Lead, increasing, moved, root, widths_of
 
 VOICES = ("filter", "analogues", "mean")
 
 
 class AnalogueReadout(nn.Module):
-    """Mean h + B (f - h) + C (h - m), deviation a sigma_f + b sigma_h + c sigma_m, by horizon.
+    """Mean h + sum_j B_j l_j (f - h) + C (h - m), deviation a sigma_f + b sigma_h + c sigma_m, by horizon.
 
-    h is the forecast of analogues, a weighted mean of demonstrations, f the filter's, m the mean of all
-    demonstrations; sigma are their deviations. The filter's members keep their order and their weights: they are
-    moved with the mean and stretched with the deviation.
+    l_j are the weights of J levels of sigma_f / sigma_m, DoF by DoF, that sum to 1, see `level_hats`. h is the
+    forecast of analogues, a weighted mean of demonstrations, f the filter's, m the mean of all demonstrations; sigma
+    are their deviations. The filter's members keep their order and their weights: they are moved with the mean and
+    stretched with the deviation.
 
     Args:
         analogues: over the same layout.
-        follow: [K, D, D], B at the seconds. A DoF that nobody fitted has a row of the identity: the filter alone.
+        follow: [K, D, J D], B_1 to B_J side by side, at the seconds. A DoF that nobody fitted has a row of the
+            identity in each: the filter alone.
         correct: [K, D, D], C; units of the row's DoF per unit of the column's, as B.
         width: [K, D, 3], a, b and c, not negative and above 0 together.
         seconds: [K] increasing; between them all are linear, before the first and behind the last as there.
             Infinity, the last, is the end.
+        levels: [J] increasing, of sigma_f / sigma_m; as the seconds. Default: one, B alike for all.
 
     Raises:
-        ValueError: shapes that do not fit, numbers that are not finite, negative widths, seconds that do not
-            increase.
+        ValueError: shapes that do not fit, numbers that are not finite, negative widths, seconds or levels that do
+            not increase.
 
     Example:
         >>> import torch
@@ -55,7 +59,7 @@ class AnalogueReadout(nn.Module):
         >>> half = 0.5 * torch.eye(primitive.layout.n_dofs).expand(5, -1, -1)
         >>> AnalogueReadout(Analogues.of(primitive), half, 0 * half, torch.ones(5, primitive.layout.n_dofs, 3) / 2)
         AnalogueReadout(
-          11 DoFs, 5 horizons, follows the filter by 0.5
+          11 DoFs, 5 horizons, 1 levels, follows the filter by 0.5
           (analogues): Analogues(
             30 demonstrations, 41 phases, compares 5 DoFs
             (table): DemonstrationTable(30 demonstrations, 41 phases, 11 DoFs)
@@ -72,6 +76,7 @@ class AnalogueReadout(nn.Module):
     correct: Tensor
     width: Tensor
     seconds: Tensor
+    levels: Tensor
 
     def __init__(
         self,
@@ -80,14 +85,13 @@ class AnalogueReadout(nn.Module):
         correct: Tensor,
         width: Tensor,
         seconds: Sequence[float] = SECONDS,
+        levels: Sequence[float] = (1.0,),
     ) -> None:
         super().__init__()
-        places = as_values("seconds", list(seconds), None, follow)
-        if not len(places) or not bool((places.diff() > 0).all() & (places >= 0).all()):
-            raise ValueError(f"seconds must increase from 0 or more, got {places.tolist()}")
-        K, D = len(places), analogues.table.n_dofs
+        places, widths = increasing("seconds", seconds, follow), increasing("levels", levels, follow)
+        K, J, D = len(places), len(widths), analogues.table.n_dofs
         for name, values, shape in (
-            ("follow", follow, (K, D, D)),
+            ("follow", follow, (K, D, J * D)),
             ("correct", correct, (K, D, D)),
             ("width", width, (K, D, len(VOICES))),
         ):
@@ -100,6 +104,7 @@ class AnalogueReadout(nn.Module):
         self.register_buffer("correct", owned(correct))
         self.register_buffer("width", owned(width))
         self.register_buffer("seconds", owned(places))
+        self.register_buffer("levels", owned(widths))
 
     def forward(
         self, forecast: Forecast, lead: Lead, mean: Tensor, variance: Tensor, present: Present | None = None
@@ -120,18 +125,21 @@ class AnalogueReadout(nn.Module):
             raise ValueError("a read-out with analogues compares the present: it needs to be told")
         theirs, spread = self.analogues.forecast(self.analogues(present), lead)
         at = horizon_hats(lead, self.seconds)  # [..., P, K]
-        both = torch.cat([forecast.mean - theirs, theirs - mean], -1)
-        K, D, _ = self.width.shape
-        every = (both @ torch.cat([self.follow, self.correct], -1).view(K * D, 2 * D).T).view(*at.shape, D)
+        widths, apart = widths_of(forecast, variance), forecast.mean - theirs
+        if len(self.levels) > 1:
+            apart = (apart.unsqueeze(-2) * level_hats(widths, self.levels).transpose(-1, -2)).flatten(-2)
+        both = torch.cat([apart, theirs - mean], -1)
+        D = self.width.shape[1]
+        every = (both @ torch.cat([self.follow, self.correct], -1).flatten(0, 1).T).view(*at.shape, D)
         stacked = theirs + (at.unsqueeze(-2) @ every).squeeze(-2)
-        widths = widths_of(forecast, variance)
         of_each = torch.stack([widths.own, root(spread), widths.demonstrated], -1)
         deviation = ((at @ self.width.flatten(1)).view_as(of_each) * of_each).sum(-1)
         return moved(forecast, stacked, deviation, torch.ones_like(deviation), widths)
 
     def together(self, dofs: Tensor) -> Tensor:
         """Those that must be forecast for some DoFs, bool [D], to be: what they are corrected by is among them."""
-        coupled = ((self.follow != 0) | (self.correct != 0)).any(0).to(dofs.device)
+        follow = (self._by_level != 0).any(-2)
+        coupled = (follow | (self.correct != 0)).any(0).to(dofs.device)
         return dofs | coupled[dofs].any(0)
 
     def select(self, view: View) -> AnalogueReadout:
@@ -141,7 +149,7 @@ class AnalogueReadout(nn.Module):
             ValueError: a view that cuts through DoFs that are forecast together.
         """
         dofs = view.dofs.to(self.follow.device)
-        kept = torch.zeros(self.follow.shape[-1], dtype=torch.bool, device=dofs.device)
+        kept = torch.zeros(self.follow.shape[-2], dtype=torch.bool, device=dofs.device)
         kept[dofs] = True
         missing = self.together(kept) & ~kept
         if bool(missing.any()):
@@ -151,15 +159,22 @@ class AnalogueReadout(nn.Module):
             )
         part = sharing(self)
         part.analogues = self.analogues.select(view)
-        part.register_buffer("follow", self.follow[:, dofs][:, :, dofs])
+        part.register_buffer("follow", self._by_level[:, dofs][..., dofs].flatten(-2))
         part.register_buffer("correct", self.correct[:, dofs][:, :, dofs])
         part.register_buffer("width", self.width[:, dofs])
         return part
 
     def extra_repr(self) -> str:
         """Sizes, and the mean of B's diagonal."""
-        K, D, _ = self.follow.shape
-        return f"{D} DoFs, {K} horizons, follows the filter by {float(self.follow.diagonal(0, 1, 2).mean()):.2g}"
+        K, D, _ = self.width.shape
+        followed = float(self._by_level.diagonal(0, 1, 3).mean())
+        return f"{D} DoFs, {K} horizons, {len(self.levels)} levels, follows the filter by {followed:.2g}"
+
+    @property
+    def _by_level(self) -> Tensor:
+        """`follow` as [K, D, J, D]."""
+        K, D, _ = self.width.shape
+        return self.follow.view(K, D, len(self.levels), D)
 
     def meant(self) -> str:
         """What its tensors mean, see `Meaning`: nothing beside themselves."""

@@ -19,11 +19,10 @@ import torch
 from torch import Tensor, nn
 
 from torch_ebip.common.ambient import owned
-from torch_ebip.common.arguments import as_values
 from torch_ebip.filtering.protocols import View
 from torch_ebip.interaction.forecast import Forecast
 from torch_ebip.interaction.present import Present
-from torch_ebip.interaction.readout import Lead, Widths, hats, moved, widths_of
+from torch_ebip.interaction.readout import Lead, Widths, hats, increasing, moved, widths_of
 
 SECONDS = (0.1, 0.25, 0.5, 1.0, math.inf)
 """Horizons, s, that have shares; infinity is the end."""
@@ -72,11 +71,7 @@ class HorizonShrinkage(nn.Module):
         levels: Sequence[float] = LEVELS,
     ) -> None:
         super().__init__()
-        places = {name: as_values(name, list(given), None, share) for name, given in
-                  (("seconds", seconds), ("levels", levels))}  # fmt: skip
-        for name, values in places.items():
-            if not len(values) or not bool((values.diff() > 0).all() & (values >= 0).all()):
-                raise ValueError(f"{name} must increase from 0 or more, got {values.tolist()}")
+        places = {"seconds": increasing("seconds", seconds, share), "levels": increasing("levels", levels, share)}
         shape = (len(places["seconds"]), len(places["levels"]))
         if share.ndim != 3 or share.shape[1:] != shape or not bool(((share >= 0) & (share <= 1)).all()):
             raise ValueError(f"share must be [D, {shape[0]}, {shape[1]}] between 0 and 1, got {list(share.shape)}")

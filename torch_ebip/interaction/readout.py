@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
+from torch_ebip.common.arguments import as_values
 from torch_ebip.common.brief import brief
 from torch_ebip.filtering.protocols import View
 from torch_ebip.interaction.forecast import Forecast
@@ -84,6 +86,18 @@ def lead_of(phase: Tensor, velocity: Tensor, of: Tensor, asked: Tensor | None = 
     going = velocity > 0
     seconds = torch.where(going, ahead / torch.where(going, velocity, 1), torch.inf)
     return Lead(ahead, torch.where(ahead > 0, seconds, 0), of, end.clamp(0, 1), asked)
+
+
+def increasing(name: str, values: Sequence[float], like: Tensor) -> Tensor:
+    """Places [K] between which something is linear, in the dtype and on the device of ``like``.
+
+    Raises:
+        ValueError: none at all, negative ones, or some that do not increase.
+    """
+    places = as_values(name, list(values), None, like)
+    if not len(places) or not bool((places.diff() > 0).all() & (places >= 0).all()):
+        raise ValueError(f"{name} must increase from 0 or more, got {places.tolist()}")
+    return places
 
 
 def hats(lead: Tensor, leads: Tensor) -> Tensor:

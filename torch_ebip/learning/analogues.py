@@ -17,6 +17,7 @@ from torch_ebip.filtering.protocols import View
 from torch_ebip.filtering.states import map_state
 from torch_ebip.interaction.analogue_readout import VOICES, AnalogueReadout
 from torch_ebip.interaction.analogues import PORTION, Analogues
+from torch_ebip.interaction.horizons import LEVELS
 from torch_ebip.interaction.present import Present
 from torch_ebip.interaction.readout import Lead
 from torch_ebip.learning.drawing import Drawn, asked_of, drawn_of
@@ -107,33 +108,37 @@ def learn_stacking(
     theirs, spread = _say(held_out, analogues, said)
     fold = held_out.partition.fold_of.to(theirs.device)[said.interaction]
     modality = layout.modality_of_dof.to(theirs.device)
-    S, D, V = said.place.shape[-1], layout.n_dofs, len(VOICES)
-    follow = torch.eye(D, dtype=theirs.dtype, device=theirs.device).repeat(S, 1, 1)
-    correct, width = torch.zeros_like(follow), theirs.new_zeros(S, D, V)
+    S, D, V, J = said.place.shape[-1], layout.n_dofs, len(VOICES), said.level.shape[-1]
+    follow = torch.eye(D, dtype=theirs.dtype, device=theirs.device).repeat(S, J, 1, 1)  # [S, J, D, D]
+    correct, width = theirs.new_zeros(S, D, D), theirs.new_zeros(S, D, V)
     width[..., 0] = 1
     drawn, deviation = torch.zeros_like(theirs), torch.zeros_like(theirs)
     shares: dict[str, Any] = {}
     for m in sorted(set(modality[targets].tolist())):
         ours, here = modality[targets] == m, ((modality == m) & targets).nonzero().squeeze(-1)
-        voices = int(corrected) * torch.cat([said.towards[..., ours] - theirs[..., ours], theirs[..., ours]], -1)
         wanted, n = said.wanted[..., ours], len(here)
+        apart = (said.towards - theirs)[..., ours].unsqueeze(-2) * said.level[..., ours, :].transpose(-1, -2)
+        voices = int(corrected) * torch.cat([apart.flatten(-2), theirs[..., ours]], -1)
         found = best_correction(voices, said.place, wanted - theirs[..., ours], fold, held_out.settings.folds)
         # B and C are in units of the scale, which each horizon has of its own.
         units = scale[:, ours]
         per = units.unsqueeze(-1) / units.unsqueeze(-2)
-        follow[:, here.unsqueeze(-1), here] = found.whole[..., :n] * per
-        correct[:, here.unsqueeze(-1), here] = found.whole[..., n:] * per
+        whole = found.whole.reshape(S, n, J + 1, n)  # [S, n, J + 1, n]
+        for j in range(J):
+            follow[:, j, here.unsqueeze(-1), here] = whole[..., j, :] * per
+        correct[:, here.unsqueeze(-1), here] = whole[..., J, :] * per
         drawn[..., ours] = theirs[..., ours] + found.left_out
         of_each = torch.stack([said.own, spread, said.demonstrated], -1)[..., ours, :]
         width[:, here], deviation[..., ours] = best_width(
             of_each, said.place, wanted - drawn[..., ours], fold, held_out.settings.folds
         )
-        diagonals = found.whole.view(S, n, 2, n).diagonal(0, 1, 3).mean(-1).tolist()  # [S, 2]
+        diagonals = whole.diagonal(0, 1, 3).mean(-1).tolist()  # [S, J + 1]
         shares[layout.names[m]] = {
             part: {name: round(values[i], 3) for name, values in zip(names, diagonals, strict=True)}
-            for i, part in enumerate(("follow", "correct"))
+            for i, part in ((0, "follow_sure"), (J - 1, "follow_unsure"), (J, "correct"))
         }
-    readout = AnalogueReadout(analogues, follow, correct, width, ahead.tolist())
+    side_by_side = follow.transpose(1, 2).flatten(-2)
+    readout = AnalogueReadout(analogues, side_by_side, correct, width, ahead.tolist(), LEVELS)
     return drawn_of(held_out, said, scored, readout, shares, drawn, deviation)
 
 

@@ -251,7 +251,8 @@ def _describe_readout(readout: Readout | None) -> Any:
     if isinstance(readout, HorizonShrinkage | AnalogueReadout):
         seconds = [s if math.isfinite(s) else "end" for s in readout.seconds.tolist()]
         if isinstance(readout, AnalogueReadout):
-            return {"seconds": seconds, "compared": readout.analogues.dofs.tolist()}
+            compared = readout.analogues.dofs.tolist()
+            return {"seconds": seconds, "levels": readout.levels.tolist(), "compared": compared}
         return {"seconds": seconds, "levels": readout.levels.tolist()}
     if isinstance(readout, Shrinkage):
         return readout.leads.tolist()
@@ -268,8 +269,9 @@ def _readout_of(description: Any, primitive: InteractionPrimitive) -> Readout:
         compared = torch.zeros(D, dtype=torch.bool, device="cpu")
         compared[description["compared"]] = True
         analogues = Analogues.of(primitive, compared)
-        square = ones(len(seconds), D, D)
-        return AnalogueReadout(analogues, square, square, ones(len(seconds), D, len(VOICES)), seconds)
+        K, levels = len(seconds), description.get("levels", [1.0])  # before version 5: one
+        follow, correct = ones(K, D, len(levels) * D), ones(K, D, D)
+        return AnalogueReadout(analogues, follow, correct, ones(K, D, len(VOICES)), seconds, levels)
     levels = description["levels"]
     return HorizonShrinkage(ones(D, len(seconds), len(levels)), ones(D, len(seconds)), seconds, levels)
 

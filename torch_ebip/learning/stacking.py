@@ -39,7 +39,7 @@ def best_correction(voices: Tensor, place: Tensor, wanted: Tensor, fold: Tensor,
     """What of some voices should be added to a forecast, by ridge regression.
 
     Args:
-        voices: [R, K, P, 2 n]: n that may be followed, and n that are pulled to nothing by a strength of their own.
+        voices: [R, K, P, m]: m - n that may be followed, and n that are pulled to nothing by a strength of their own.
         place: [R, K, P, S], see `horizon_hats`.
         wanted: [R, K, P, n], what is missing; NaN: not measured.
         fold: int64 [R].
@@ -47,7 +47,7 @@ def best_correction(voices: Tensor, place: Tensor, wanted: Tensor, fold: Tensor,
     """
     width = voices.shape[-1]
     S, n = place.shape[-1], wanted.shape[-1]
-    design = (place.unsqueeze(-1) * voices.unsqueeze(-2)).flatten(-2)  # [R, K, P, S 2n]
+    design = (place.unsqueeze(-1) * voices.unsqueeze(-2)).flatten(-2)  # [R, K, P, S m]
     measured = ~wanted.isnan().any(-1)
     grams, moments = [], []
     for f in range(folds):
@@ -56,7 +56,7 @@ def best_correction(voices: Tensor, place: Tensor, wanted: Tensor, fold: Tensor,
         grams.append(a.T @ a)
         moments.append(a.T @ y)
     gram, moment = torch.stack(grams), torch.stack(moments)
-    which = torch.arange(width, device=voices.device).repeat(S) < n
+    which = torch.arange(width, device=voices.device).repeat(S) < width - n
     best: tuple[float, Tensor, Tensor] | None = None
     for pull, fixed in product(PULLS, FIXED):
         ridge = torch.diag(torch.where(which, pull, fixed).double())
