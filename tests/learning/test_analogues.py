@@ -29,7 +29,7 @@ from torch_ebip.learning import InteractionModel
 from torch_ebip.learning.configuration import Task
 from torch_ebip.learning.held_out import HeldOut, Trial
 from torch_ebip.learning.recently import recent_sums
-from torch_ebip.learning.stacking import best_correction, best_width
+from torch_ebip.learning.stacking import FIXED, PULLS, best_correction, best_width
 
 QUICK = {"steps": 0, "scan": 6}
 
@@ -140,13 +140,31 @@ def test_a_correction_is_ridge_regression_judged_by_folds() -> None:
         x, y = x[some], y[some]
         off = [
             np.abs(np.linalg.solve(x.T @ x + np.diag([a, a, b, b]), x.T @ y).T - found.whole[p].numpy()).max()
-            for a in (30, 100, 300, 1000, 3000) for b in (100, 1e4, 1e8)
-        ]  # fmt: skip
+            for a in PULLS
+            for b in FIXED
+        ]
         assert min(off) < 1e-8
     assert float((found.whole[..., :2] - true).abs().max()) < 0.35
     assert float(found.whole[..., 2:].abs().max()) < 0.05
     left_out = (wanted - found.left_out).square().nanmean()
     assert float(left_out) < 0.3 * float(wanted.square().nanmean())
+
+
+def test_the_filter_is_followed_where_it_is_sure() -> None:
+    """Of values that it knows exactly where it is sure, and that are noise where it is not."""
+    draws = torch.Generator().manual_seed(0)
+    known, mean = torch.randn(2, 80, 3, 1, 2, generator=draws)
+    sure = (torch.rand(80, 3, 1, 2, generator=draws) > 0.5).float()
+    said = torch.where(sure > 0, known, torch.randn(known.shape, generator=draws))
+    levels = torch.stack([sure, 1 - sure], -2)
+    voices = torch.cat([(said.unsqueeze(-2) * levels).flatten(-2), mean], -1)
+    place, fold = torch.ones(80, 3, 1, 1), torch.arange(80) % 5
+    gated, alike = (best_correction(v, place, known, fold, 5) for v in (voices, torch.cat([said, mean], -1)))
+    surely, unsurely = gated.whole[0, :, :2], gated.whole[0, :, 2:4]
+    torch.testing.assert_close(surely, torch.eye(2), atol=0.1, rtol=0)
+    assert float(unsurely.abs().max()) < 0.2
+    errors = [float((known - each.left_out).square().mean()) for each in (gated, alike)]
+    assert errors[0] < 0.7 * errors[1]
 
 
 def test_widths_are_those_that_hold_the_error() -> None:

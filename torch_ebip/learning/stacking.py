@@ -12,7 +12,7 @@ from torch_ebip.common.brief import brief
 from torch_ebip.filtering.functional.scores import gaussian_crps
 from torch_ebip.learning.shares import widening
 
-PULLS = (30.0, 100.0, 300.0, 1000.0, 3000.0)
+PULLS = (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
 """Towards analogues alone, that are tried; in moments."""
 FIXED = (100.0, 1e4, 1e8)
 """Against a correction by the mean, that are tried: the last allows none."""
