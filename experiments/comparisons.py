@@ -44,21 +44,30 @@ def compared(methods: Mapping[str, NDArray[np.float64]], against: str) -> list[d
     Returns:
         ``a``, ``b`` and two-sided ``p_value`` of Mann and Whitney's U, as in the paper, and ``p_paired`` of
         Wilcoxon's signed ranks, which sees smaller differences: all methods are asked about the same interactions.
+        ``lead`` and ``lead_paired``, -1 to 1, are how far a has the larger ranks in each: means may say otherwise.
     """
-    from scipy.stats import mannwhitneyu, wilcoxon  # half a second that no process without a table should wait for
+    from scipy.stats import (  # half a second that no process without a table should wait for
+        mannwhitneyu,
+        rankdata,
+        wilcoxon,
+    )
 
     rows, ours = [], methods[against]
     for name, theirs in methods.items():
         if name == against or not len(mine := ours[~np.isnan(ours)]) or not len(other := theirs[~np.isnan(theirs)]):
             continue
-        p_value = float(mannwhitneyu(mine, other).pvalue)
-        paired = math.nan
+        tested = mannwhitneyu(mine, other)
+        lead = 2 * float(tested.statistic) / (len(mine) * len(other)) - 1
+        paired, lead_paired = math.nan, math.nan
         if len(ours) == len(theirs):
             difference = (ours - theirs)[~np.isnan(ours - theirs)]
+            ranks = rankdata(np.abs(difference))
+            lead_paired = float((np.sign(difference) * ranks).sum() / max(ranks.sum(), 1.0))
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of few samples scipy says that it approximates
                 paired = float(wilcoxon(difference).pvalue) if (difference != 0).any() else 1.0
-        rows.append({"a": against, "b": name, "p_value": p_value, "p_paired": paired})
+        p_values = {"p_value": float(tested.pvalue), "p_paired": paired}
+        rows.append({"a": against, "b": name, **p_values, "lead": lead, "lead_paired": lead_paired})
     return rows
 
 
@@ -87,27 +96,24 @@ def verdicts(results: Mapping[str, Any]) -> list[dict[str, Any]]:
 
     Returns:
         Without a reference nothing; else a row each with ``metric``, ``modality``, ``ahead`` (None: the end),
-        ``method``, ``cells``, ``better`` and ``worse`` (their number with an adjusted p of either test below
-        `LEVEL`), ``p_worse``, the smallest adjusted p of a cell where the reference has the larger mean, 1 where
-        there is none.
+        ``method``, ``cells``, ``better`` and ``worse`` (their number where either test says so with an adjusted p
+        below `LEVEL`), ``p_worse``, the smallest adjusted p of a test in which the reference has the larger ranks,
+        1 where there is none.
     """
-    means = {
-        (r["subset"], r["observed"], r["metric"], r["modality"], r.get("ahead"), r["method"]): r["mean"]
-        for r in results["rows"]
-    }
     if results["reference"] is None:
         return []
-    tables: dict[tuple[Any, ...], list[tuple[float, float]]] = {}
+    tables: dict[tuple[Any, ...], list[dict[bool, float]]] = {}
     for c in results["comparisons"]:
-        cell = (c["subset"], c["observed"], c["metric"], c["modality"], c.get("ahead"))
-        ours, theirs = means[(*cell, c["a"])], means[(*cell, c["b"])]
-        p = min(c["p_holm"], 1.0 if math.isnan(c["p_paired_holm"]) else c["p_paired_holm"])
-        tables.setdefault((*cell[2:], c["b"]), []).append((ours - theirs, p))
+        smallest = {False: 1.0, True: 1.0}  # by whether the reference has the larger ranks, and is worse
+        for lead, p in ((c["lead"], c["p_holm"]), (c["lead_paired"], c["p_paired_holm"])):
+            if not math.isnan(p):
+                smallest[lead > 0] = min(smallest[lead > 0], p)
+        tables.setdefault(tuple(c.get(key) for key in TABLE), []).append(smallest)
     return [
         {
             "metric": metric, "modality": modality, "ahead": ahead, "method": method, "cells": len(cells),
-            "better": sum(d < 0 and p < LEVEL for d, p in cells), "worse": sum(d > 0 and p < LEVEL for d, p in cells),
-            "p_worse": min((p for d, p in cells if d > 0), default=1.0),
+            "better": sum(p[False] < LEVEL for p in cells), "worse": sum(p[True] < LEVEL for p in cells),
+            "p_worse": min(p[True] for p in cells),
         }
         for (metric, modality, ahead, method), cells in tables.items()
         if metric != "coverage_95"

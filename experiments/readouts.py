@@ -47,7 +47,7 @@ def held_out_of(fold: Fold, subsets: Mapping[str, Tensor] | None = None) -> Held
     """A fold's interactions as `learn` has them, with some sets of sensors, bool [D] by name; default: all."""
     tuned = fold.tuned()
     settings = settings_for(fold.known, 1, fold.seed, None, {"thinning": fold.tuning.thinning})
-    task = Task(tuned.primitive, tuned.objective, tuned.targets, subsets or tuned.subsets)
+    task = Task(tuned.primitive, tuned.objective, tuned.targets, tuned.subsets if subsets is None else subsets)
     return HeldOut(fold.known, task, settings)
 
 
@@ -79,10 +79,15 @@ class UnseenMethod:
 
     Args:
         fold: the training part.
+
+    Raises:
+        ValueError: a single set.
     """
 
     def __init__(self, fold: Fold) -> None:
         masks = fold.tuned().subsets
+        if len(masks) < 2:
+            raise ValueError(f"no other set of sensors to learn from: there is only {', '.join(masks)}")
         self._methods = [
             (mask.cpu(), FilterMethod(with_readout(fold, _analogues, subsets=_others(masks, name)), fold.seed))
             for name, mask in masks.items()

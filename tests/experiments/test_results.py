@@ -25,7 +25,7 @@ def test_rows_follow_the_contract() -> None:
     assert row["mean"] == pytest.approx(sample.mean())
     assert row["standard_error"] == pytest.approx(sample.std(ddof=1) / np.sqrt(40))
     comparison = results["comparisons"][0]
-    tests = {"p_value", "p_holm", "p_paired", "p_paired_holm"}
+    tests = {"p_value", "p_holm", "p_paired", "p_paired_holm", "lead", "lead_paired"}
     assert set(comparison) == {"subset", "observed", "metric", "modality", "a", "b"} | tests
     assert comparison["p_value"] == pytest.approx(mannwhitneyu(VALUES[CELLS[0]]["ebip_tuned"], sample).pvalue)
     means = [r["mean"] for r in results["rows"] if r["method"] == "mean"]
@@ -78,3 +78,14 @@ def test_a_reference_is_told_where_it_is_worse() -> None:
     (line,) = (line for line in text.splitlines() if line.startswith("| `b`") and "±" in line)
     assert ["†" in cell for cell in line.split("|")[2:5]] == [True, True, False]
     assert verdicts(summarise(values)) == []
+
+
+def test_a_verdict_goes_by_the_test_not_by_a_few_outliers() -> None:
+    """Of 60 pairs the reference wins 55; the five it loses, it loses by far, so that its mean is larger."""
+    ours = np.random.default_rng(0).uniform(1, 2, 60)
+    theirs = ours + 0.1
+    ours[:5] += 5
+    cell = Cell("all", 0.82, "mae", "ball", "m")
+    (verdict,) = verdicts(summarise({cell: {"a": ours, "b": theirs}}, "a"))
+    assert ours.mean() > theirs.mean()
+    assert (verdict["better"], verdict["worse"]) == (1, 0)

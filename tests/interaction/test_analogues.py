@@ -363,3 +363,53 @@ def test_parameters_that_change_are_noticed_and_a_table_too() -> None:
     analogy = analogues(present)
     whole, part = analogues.forecast(analogy, lead)[0], analogues.select(view).forecast(analogy, lead)[0]
     torch.testing.assert_close(part, whole[..., 3:])
+
+
+def test_silence_of_any_length_is_finite_and_has_gradients() -> None:
+    """In float32 what is left of the last samples underflows piece by piece: first squares, then the rest."""
+    primitive = small_primitive()
+    filter = bent(primitive, weigh=True)
+    y, observed = (part[0, :10] for part in interactions(1, seed=7).pad())
+    began = filter(y, observed & ~primitive.layout.controlled, generator=torch.Generator().manual_seed(0)).state
+    beliefs = []
+    for gap in torch.arange(0.0, 4.0, 0.05).tolist():
+        state = filter.predict(began, gap, generator=torch.Generator().manual_seed(1)) if gap else began
+        # Of two sensors one goes on, or both are silent.
+        goes_on = torch.where(torch.tensor([False, False, True, False, False]), y[-1], torch.nan)
+        for now in (state, filter.update(state, goes_on)[0]):
+            said = filter.forecast(now, ahead=[0.1, END])
+            assert said.mean.isfinite().all(), gap
+            assert said.variance.isfinite().all(), gap
+            gradients = torch.autograd.grad(
+                said.mean.sum() + said.variance.sum(), list(filter.readout.parameters()), retain_graph=True
+            )
+            assert all(gradient.isfinite().all() for gradient in gradients), gap
+            beliefs.append(float(filter.present(now).line.belief.max()))
+    assert min(beliefs) == 0 < max(beliefs)
+
+
+def test_a_sensor_that_never_moved_says_nothing() -> None:
+    """Its velocity over the demonstrations is rounding; a new one that trembles is no news."""
+    known = interactions(24, dtype=torch.float64)
+    constant = [torch.cat([each[:, :2], torch.full_like(each[:, :1], 100.3), each[:, 3:]], 1) for each in known]
+    primitive = InteractionPrimitive.fit(
+        Demonstrations(known.layout, constant, known.rate), small_primitive(torch.float64).basis
+    )
+    analogues, present = Analogues.of(primitive), present_of(primitive)
+    assert analogues.scale[0, 2] == 0
+    draws = torch.Generator().manual_seed(0)  # with other bases there is rounding
+    analogues.table.cells[:, :, 1, 2] = 1e-14 * torch.randn(24, 40, generator=draws, dtype=torch.float64)
+    analogues.scale[1, 2] = 1e-14
+    trembling = present.line.velocity.clone()
+    trembling[..., 2] += 1e-3
+    other = present._replace(line=present.line._replace(velocity=trembling))
+    torch.testing.assert_close(analogues(present).weights, analogues(other).weights, rtol=0, atol=0)
+
+
+def test_what_is_forecast_together_is_found_through_others() -> None:
+    """The first DoF is corrected by the second, that by the third."""
+    primitive = small_primitive()
+    follow = torch.eye(5).repeat(5, 1, 1)
+    follow[:, 0, 1] = follow[:, 1, 2] = 0.1
+    readout = AnalogueReadout(Analogues.of(primitive), follow, torch.zeros(5, 5, 5), torch.ones(5, 5, 3))
+    assert readout.together(torch.tensor([True, False, False, False, False])).tolist() == [True] * 3 + [False] * 2

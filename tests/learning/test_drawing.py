@@ -8,7 +8,7 @@ import torch
 
 from torch_ebip.learning import Weights, remaining
 from torch_ebip.learning.said import Said
-from torch_ebip.learning.shares import CERTAIN, DOUBT, trust, widening
+from torch_ebip.learning.shares import CERTAIN, DOUBT, standard_errors, trust, widening
 
 
 def said(rho: float, n: int = 40, heavy: bool = False) -> Said:
@@ -92,3 +92,14 @@ def test_what_remains_is_what_no_share_of_a_forecast_explains(monkeypatch: pytes
     share = np.clip((t[known] @ w[known]) / (t[known] @ t[known]), 0, 1)
     of_tool = np.abs(w - share * t)[known].mean() / np.abs(w)[known].mean()
     assert remaining.remaining_error(held_out(**tool), None, None) == pytest.approx((2 * alone + 3 * of_tool) / 5)
+
+
+@pytest.mark.parametrize("rest", [0.0, 4.4e-16, 2.4e-7])
+def test_who_comes_near_a_horizon_by_rounding_says_nothing_of_it(rest: float) -> None:
+    """Half of the interactions end before it; what is left of their weight is rounding."""
+    draws = torch.Generator().manual_seed(0)
+    wanted = torch.randn(24, 1, 1, 1, generator=draws)
+    weight = torch.cat([torch.ones(12, 1, 1, 1), torch.full((12, 1, 1, 1), rest)])
+    found = standard_errors(torch.arange(24), wanted, 0.8 * wanted, weight)
+    alone = standard_errors(torch.arange(12), wanted[:12], 0.8 * wanted[:12])
+    assert found == pytest.approx(alone, rel=1e-6)

@@ -140,7 +140,9 @@ class AnalogueReadout(nn.Module):
         """Those that must be forecast for some DoFs, bool [D], to be: what they are corrected by is among them."""
         follow = (self._by_level != 0).any(-2)
         coupled = (follow | (self.correct != 0)).any(0).to(dofs.device)
-        return dofs | coupled[dofs].any(0)
+        while bool((coupled[dofs].any(0) & ~dofs).any()):  # and what those are corrected by
+            dofs = dofs | coupled[dofs].any(0)
+        return dofs
 
     def select(self, view: View) -> AnalogueReadout:
         """The same for a view of the model: of its DoFs.

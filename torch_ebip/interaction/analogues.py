@@ -171,7 +171,7 @@ class Analogues(nn.Module):
         values = self.table.values[..., self.dofs]
         velocities = self.table.slopes[..., self.dofs] * self.pace[:, None, None]
         middle = torch.stack([values.mean((0, 1)), torch.zeros_like(values[0, 0])])
-        moved = self.scale > 0
+        moved = (self.scale > 0) & (self.scale[:1] > 0)  # what stands still has a velocity of rounding alone
         inverse = torch.where(moved, 1 / torch.where(moved, self.scale, 1), 0)
         both = (torch.stack([values, velocities], -2) - middle) * inverse
         flat = both.clamp(-FAR, FAR).flatten(-2).transpose(0, 1)
@@ -231,10 +231,11 @@ class Analogues(nn.Module):
         parts = torch.stack([line.value, line.velocity, belief, belief * line.moves], -2).index_select(-1, self.dofs)
         x = ((parts[..., :2, :] - constants.middle) * constants.inverse).clamp(-FAR, FAR)
         here = parts[..., 2:, :] * constants.moved
-        total, squares = here @ constants.sensors, here.square() @ constants.sensors
+        total = here @ constants.sensors @ constants.sensors.T  # of each DoF's sensor
         # Of a sensor whose DoFs are all believed alike each has an equal share, together as much as one is believed.
-        share = squares / torch.where(total > 0, total, 1).square()
-        return x, here * (share @ constants.sensors.T)
+        # Parts are squared, not what is believed, whose square is 0 long before it is.
+        part = here / torch.where(total > 0, total, 1)
+        return x, here * (part.square() @ constants.sensors @ constants.sensors.T)
 
     def forecast(self, analogy: Analogy, lead: Lead) -> tuple[Tensor, Tensor]:
         """Mean and variance [..., P, D] of what came of them: each at its own pace where seconds were asked for.
@@ -280,6 +281,7 @@ class Analogues(nn.Module):
 def _reached(phase: Tensor, variance: Tensor, count: int) -> slice:
     """Those of ``count`` phases that are within `REACH` of some phase [R]."""
     reach = REACH * variance.detach().sqrt()
+    phase = phase.detach()
     low, high = float((phase - reach).min()), float((phase + reach).max())
     if not (math.isfinite(low) and math.isfinite(high)):
         return slice(0, count)

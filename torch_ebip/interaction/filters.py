@@ -173,8 +173,12 @@ class InteractionFilter(Filter):
             ValueError: a state without members, made by hand, or of an update that has no `Recent`.
         """
         memory, recent = getattr(state, "memory", None), self.recent
-        if memory is None or recent is None or memory.recent is None:
+        if recent is None:
             raise ValueError("nobody remembers what was seen of late: the filter's update has no `Recent`")
+        if memory is None or memory.recent is None:
+            raise ValueError(
+                "a state made by hand does not remember what was seen of late: `initial_state` makes one that does"
+            )
         count = len(self.prior.states)  # type: ignore[arg-type]
         return present_of(state[0][..., 0], memory, recent, count)
 

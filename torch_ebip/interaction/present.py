@@ -62,7 +62,8 @@ def present_of(phase: Tensor, memory: Memory, recent: Recent, count: int) -> Pre
     weights = torch.full_like(phase, 1 / phase.shape[-1]) if weighting is None else weighting.weights
     mean = (weights * phase).sum(-1)
     square = (weights * (phase - mean.unsqueeze(-1)).square()).sum(-1)
-    variance = square / (1 - weights.square().sum(-1))  # as that of an ensemble
+    several = 1 - weights.square().sum(-1)
+    variance = square / several.clamp(min=torch.finfo(several.dtype).eps)  # as that of an ensemble
     return Present(mean, variance, prior_of(memory, count), recent.line(memory.recent))
 
 

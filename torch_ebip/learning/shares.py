@@ -12,6 +12,8 @@ from torch import Tensor
 
 from torch_ebip.learning.metrics import Z95
 
+NEXT_TO_NOTHING = 1e-3
+"""Weight, in moments, up to which an interaction says nothing of a horizon: it came near it by rounding."""
 SWEEPS = 200
 """Of coordinate descent on a handful of shares."""
 DOUBT, CERTAIN = 1.5, 4.0
@@ -79,7 +81,7 @@ def trust(interaction: Tensor, wanted: Tensor, drawn: Tensor, place: Tensor) -> 
     found = drawn.new_ones(place.shape[-1])
     for s in range(len(found)):
         weight = place[..., s].unsqueeze(-1)
-        if bool((weight.expand_as(wanted)[~wanted.isnan()] > 0).any()):
+        if bool((weight.expand_as(wanted)[~wanted.isnan()] > NEXT_TO_NOTHING).any()):
             z = standard_errors(interaction, wanted, drawn, weight)
             found[s] = min(max((z - DOUBT) / (CERTAIN - DOUBT), 0.0), 1.0)
     return found
@@ -101,7 +103,7 @@ def standard_errors(interaction: Tensor, wanted: Tensor, drawn: Tensor, weight: 
     sums = gain.new_zeros(2, int(interaction.max()) + 1)
     sums[0].index_add_(0, interaction, gain.sum((1, 2, 3)))
     sums[1].index_add_(0, interaction, weight.sum((1, 2, 3)))
-    each = (sums[0] / sums[1].clamp(min=1e-9))[sums[1] > 0]
+    each = (sums[0] / sums[1].clamp(min=1e-9))[sums[1] > NEXT_TO_NOTHING]
     if len(each) < 2:
         return 0.0
     return float(each.mean() / (each.std() / len(each) ** 0.5).clamp(min=1e-12))

@@ -25,6 +25,8 @@ from torch_ebip.filtering.updates.weighting import Seen
 
 WINDOW = 0.03
 """s, over which the last samples of a DoF make a line."""
+FAINT = 1e-9
+"""Belief below which nothing is believed: what is left of a sensor that fell silent, until its numbers underflow."""
 LEAST = 1e-30
 """Samples that must be left of a DoF, after forgetting, for a line to be drawn."""
 HOLD = 0.15
@@ -165,6 +167,7 @@ class Recent(Part):
         # As if the samples were from now: what the last ones count.
         counted = (samples * torch.exp(-time / self.window)).clamp(max=1)
         belief = torch.where(some, counted * torch.exp(-0.5 * (time / HOLD).square()), 0)
+        belief = torch.where(belief > FAINT, belief, 0)
         return Line(present, velocity, belief, moves)
 
     def __getstate__(self) -> dict[str, Any]:
