@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 LEVEL = 0.05
 """Adjusted p below which two methods are said to differ."""
+LARGER_IS_BETTER = ("accuracy",)
+"""All other metrics are errors, but for coverage."""
 TABLE = ("metric", "modality", "ahead", "b")
 """What the cells of one line of a table have in common."""
 
@@ -97,17 +99,18 @@ def verdicts(results: Mapping[str, Any]) -> list[dict[str, Any]]:
     Returns:
         Without a reference nothing; else a row each with ``metric``, ``modality``, ``ahead`` (None: the end),
         ``method``, ``cells``, ``better`` and ``worse`` (their number where either test says so with an adjusted p
-        below `LEVEL`), ``p_worse``, the smallest adjusted p of a test in which the reference has the larger ranks,
-        1 where there is none.
+        below `LEVEL`), ``p_worse``, the smallest adjusted p of a test in which the reference has the worse ranks,
+        1 where there is none. Coverage, which should be neither large nor small, has none.
     """
     if results["reference"] is None:
         return []
     tables: dict[tuple[Any, ...], list[dict[bool, float]]] = {}
     for c in results["comparisons"]:
-        smallest = {False: 1.0, True: 1.0}  # by whether the reference has the larger ranks, and is worse
+        smallest = {False: 1.0, True: 1.0}  # by whether the reference is worse
         for lead, p in ((c["lead"], c["p_holm"]), (c["lead_paired"], c["p_paired_holm"])):
             if not math.isnan(p):
-                smallest[lead > 0] = min(smallest[lead > 0], p)
+                worse = (lead < 0) if c["metric"] in LARGER_IS_BETTER else (lead > 0)
+                smallest[worse] = min(smallest[worse], p)
         tables.setdefault(tuple(c.get(key) for key in TABLE), []).append(smallest)
     return [
         {

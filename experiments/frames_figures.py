@@ -30,7 +30,8 @@ def frames_figure(name: str, filter: Filter, trajectory: Tensor, layout: Layout,
         shown: bool [D], sensors.
         dof: what is drawn.
     """
-    used = shown | layout.mask([dof])
+    # DoFs of a modality are forecast together.
+    used = shown | layout.mask([layout.names[int(layout.modality_of_dof[layout.dofs.index(dof)])]])
     column = [d for d, kept in zip(layout.dofs, used.tolist(), strict=True) if kept].index(dof)
     unit = layout.units[layout.dofs.index(dof)]
     last = len(trajectory) - 1

@@ -89,3 +89,6 @@ def test_a_verdict_goes_by_the_test_not_by_a_few_outliers() -> None:
     (verdict,) = verdicts(summarise({cell: {"a": ours, "b": theirs}}, "a"))
     assert ours.mean() > theirs.mean()
     assert (verdict["better"], verdict["worse"]) == (1, 0)
+    (verdict,) = verdicts(summarise({cell._replace(metric="accuracy"): {"a": ours, "b": theirs}}, "a"))
+    assert (verdict["better"], verdict["worse"]) == (0, 1)
+    assert verdicts(summarise({cell._replace(metric="coverage_95"): {"a": ours, "b": theirs}}, "a")) == []
