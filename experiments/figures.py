@@ -109,6 +109,12 @@ def horizons_figure(results: Mapping[str, Any], panels: Sequence[tuple[str, str 
     return figure
 
 
+def whole_modalities(layout: Layout, dofs: Sequence[str]) -> Tensor:
+    """Bool [D], the modalities of some DoFs: those of one are forecast together."""
+    modalities = [int(layout.modality_of_dof[layout.dofs.index(dof)]) for dof in dofs]
+    return layout.mask([layout.names[m] for m in sorted(set(modalities))])
+
+
 def forecast_figure(
     filters: Mapping[str, Filter],
     tests: Demonstrations,
@@ -124,7 +130,7 @@ def forecast_figure(
         len(dofs), len(fractions), figsize=(4.5 * len(fractions), 2.4 * len(dofs)), squeeze=False,
         sharex=True, sharey="row", layout="constrained",
     )  # fmt: skip
-    used = subset | layout.mask(dofs)
+    used = subset | whole_modalities(layout, dofs)
     names = [dof for dof, kept in zip(layout.dofs, used.tolist(), strict=True) if kept]
     for column, fraction in enumerate(fractions):
         now = round(fraction * (last + 1)) - 1

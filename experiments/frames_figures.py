@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from scipy.stats import gaussian_kde
 from torch import Tensor
 
-from experiments.figures import colour, plain
+from experiments.figures import colour, plain, whole_modalities
 from torch_ebip import Filter, Forecast, Layout
 
 FRACTIONS = (0.1, 0.3, 0.43, 0.6, 0.82, 0.95)
@@ -30,8 +30,7 @@ def frames_figure(name: str, filter: Filter, trajectory: Tensor, layout: Layout,
         shown: bool [D], sensors.
         dof: what is drawn.
     """
-    # DoFs of a modality are forecast together.
-    used = shown | layout.mask([layout.names[int(layout.modality_of_dof[layout.dofs.index(dof)])]])
+    used = shown | whole_modalities(layout, [dof])
     column = [d for d, kept in zip(layout.dofs, used.tolist(), strict=True) if kept].index(dof)
     unit = layout.units[layout.dofs.index(dof)]
     last = len(trajectory) - 1
