@@ -416,3 +416,12 @@ def test_what_is_forecast_together_is_found_through_others() -> None:
     follow[:, 0, 1] = follow[:, 1, 2] = 0.1
     readout = AnalogueReadout(Analogues.of(primitive), follow, torch.zeros(5, 5, 5), torch.ones(5, 5, 3))
     assert readout.together(torch.tensor([True, False, False, False, False])).tolist() == [True] * 3 + [False] * 2
+
+
+def test_no_horizons_are_no_error() -> None:
+    """Without a read-out; and basis functions of a phase that is NaN are NaN, not an index that there is not."""
+    primitive = small_primitive()
+    filter = ebip(primitive, weigh=True)
+    assert filter.forecast(filter.initial_state((2,)), ahead=[]).mean.shape == (2, 0, 5)
+    for basis in primitive.basis.families:
+        assert basis(torch.tensor([0.5, math.nan]))[1].isnan().any()

@@ -64,8 +64,8 @@ class BSplineBasis(Basis):
         """Coefficients [..., degree + 1, n_features] at phases [...], and the local coordinates [..., 1] there."""
         pieces = self.n_features - self.degree
         scaled = phase * pieces
-        piece = scaled.detach().floor().clamp(0, pieces - 1)
-        found = self.pieces.to(phase).index_select(0, piece.long().reshape(-1))
+        piece = scaled.detach().floor().long().clamp(0, pieces - 1)  # a phase that is NaN has one, too
+        found = self.pieces.to(phase).index_select(0, piece.reshape(-1))
         return found.view(*phase.shape, *found.shape[1:]), (scaled - piece).unsqueeze(-1)
 
     def settings(self) -> dict[str, int | float | bool]:

@@ -123,8 +123,7 @@ class StackedBasis(nn.Module):
         Returns:
             [..., P, E, D] and [..., P, E + others, D], units of the DoFs: h of a whole set is their sum.
         """
-        low, high = torch.aminmax(phase.detach())
-        inside = float(low) >= 0 and float(high) <= 1
+        inside = bool(((phase >= 0) & (phase <= 1)).all())
         features = [basis.within(phase) if inside else basis(phase) for basis in self.families]
         E = weights.shape[-2]
         by_member = [each[..., :E, :].movedim(-3, -1) for each in features]  # one product a member, of all its phases
