@@ -111,6 +111,19 @@ def test_time_does_not_run_backwards(kind: str, dt: Any) -> None:
             made(torch.ones(2, 4, 5), dt=dt)
 
 
+@pytest.mark.parametrize("kind", FILTERS)
+@pytest.mark.parametrize("shape", [(2, 4), (4,), (3, 2)])
+def test_clocks_are_those_of_the_batch(kind: str, shape: tuple[int, ...]) -> None:
+    """Not one for each sample."""
+    made, dt = FILTERS[kind](small_primitive()), torch.full(shape, 0.03)
+    message = r"dt must be a number, or one for each of a batch \[2\], got"
+    with pytest.raises(ValueError, match=message):
+        made.predict(made.initial_state((2,)), dt)
+    with pytest.raises(ValueError, match=message):
+        made(torch.ones(2, 4, 5), dt=dt)
+    assert made(torch.ones(2, 4, 5), dt=dt.flatten()[:2]).phase.shape == (2, 4)
+
+
 @pytest.mark.parametrize("dt", [-1 / 60, math.nan, math.inf])
 def test_nor_live(dt: float) -> None:
     live = LiveFilter(ebip(small_primitive()))

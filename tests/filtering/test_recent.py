@@ -103,6 +103,15 @@ def test_a_view_writes_into_the_memory_of_all() -> None:
     assert recent.line(narrower.learn(sums, seen(torch.tensor([4.0])))).value.tolist() == [0, 4.0, 0, 2.0]
 
 
+def test_another_window_is_noticed() -> None:
+    """Also where the step of time is the same tensor as before."""
+    recent, sums, dt = Recent(torch.zeros(1)), torch.ones(5, 1), torch.tensor(0.01)
+    before = recent.forget(sums, dt)
+    recent.window = 10 * recent.window
+    assert torch.equal(recent.forget(sums, dt), Recent(torch.zeros(1), recent.window).forget(sums, dt))
+    assert not torch.equal(recent.forget(sums, dt), before)
+
+
 def test_entries_of_a_batch_have_clocks_of_their_own() -> None:
     recent = Recent(torch.zeros(1, dtype=torch.float64))
     y = torch.tensor([[1.0], [2.0]], dtype=torch.float64)

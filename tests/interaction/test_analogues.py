@@ -19,7 +19,8 @@ from torch_ebip.filtering.states import map_state
 from torch_ebip.filtering.updates.recent import Line
 from torch_ebip.interaction import InteractionEnsembleFilter
 from torch_ebip.interaction.analogue_readout import AnalogueReadout
-from torch_ebip.interaction.analogues import FAR, LEAST, REACH, Analogues
+from torch_ebip.interaction.analogues import LEAST, REACH, UNLIKE, Analogues
+from torch_ebip.interaction.compared import FAR
 from torch_ebip.interaction.present import Present, prior_of
 from torch_ebip.interaction.readout import Lead
 
@@ -106,12 +107,15 @@ def test_weights_are_those_of_the_formula() -> None:
 
 def test_what_came_of_them_is_at_their_own_pace() -> None:
     primitive = small_primitive(torch.float64)
-    analogues = Analogues.of(primitive)
-    analogy = analogues(present_of(primitive))
+    analogues, present = Analogues.of(primitive), present_of(primitive)
+    analogy = analogues(present)
     asked = torch.tensor([0.1, 0.4, END], dtype=torch.float64)
     nothing = torch.zeros(3, 3, dtype=torch.float64)
     mean, variance = analogues.forecast(analogy, Lead(nothing, nothing, nothing, nothing, asked))
     w, phase = analogy.weights.detach().numpy(), analogy.phase.detach().numpy()
+    there = (present.prior > -math.inf).numpy()
+    unlike = UNLIKE / (UNLIKE + 1 / (w**2).sum(-1, keepdims=True))
+    wide = (1 - unlike) * w + unlike * there / there.sum(-1, keepdims=True)
     for row in range(3):
         for p, seconds in enumerate(asked.tolist()):
             at = (
@@ -122,7 +126,7 @@ def test_what_came_of_them_is_at_their_own_pace() -> None:
             paths = primitive.basis.project(torch.tensor(at), primitive.weights).numpy()
             expected = w[row] @ paths
             np.testing.assert_allclose(mean[row, p].detach(), expected, atol=2e-5)
-            np.testing.assert_allclose(variance[row, p].detach(), w[row] @ (paths - expected) ** 2, atol=2e-5)
+            np.testing.assert_allclose(variance[row, p].detach(), wide[row] @ (paths - expected) ** 2, atol=2e-5)
     lead = Lead(nothing, nothing, torch.tensor([0.5, 0.8, 1.0]).double().expand(3, -1), nothing)
     mean, _ = analogues.forecast(analogy, lead)
     paths = torch.stack(
@@ -146,7 +150,24 @@ def test_what_is_exactly_there_is_found() -> None:
     even = torch.full((24, 24), -math.log(24), dtype=torch.float64)
     found = analogues(Present(phase.expand(24), torch.full((24,), 0.01).double(), even, line))
     assert (found.weights.argmax(-1) == torch.arange(24)).all()
-    assert float(found.weights.diagonal().min()) > 0.5
+    assert float(found.weights.detach().diagonal().min()) > 0.5
+
+
+def test_one_that_has_all_weight_is_not_sure_of_all_that_comes() -> None:
+    """As wide as a chance of 1 in 11 makes it that it is none of them; without that it would be as narrow as 0."""
+    primitive = small_primitive(torch.float64)
+    present = present_of(primitive)
+    only = torch.full_like(present.prior, -40.0)
+    only[:, 7] = 0.0
+    lead = Lead(*torch.ones(4, 3, 1).double())
+    paths = primitive.basis.project(torch.tensor(1.0).double(), primitive.weights)
+    for unlike, share in ((UNLIKE, 1 / 11), (0.0, 0.0)):
+        analogues = Analogues.of(primitive, unlike=unlike)
+        with torch.no_grad():
+            analogues.memory.raw.fill_(20.0)
+        _, variance = analogues.forecast(analogues(present._replace(prior=only)), lead)
+        apart = share * (paths - paths[7]).square().mean(0)
+        np.testing.assert_allclose(variance[:, 0].detach(), apart.expand(3, -1), rtol=1e-3, atol=1e-6)
 
 
 def test_units_and_places_change_nothing() -> None:
@@ -416,6 +437,15 @@ def test_what_is_forecast_together_is_found_through_others() -> None:
     follow[:, 0, 1] = follow[:, 1, 2] = 0.1
     readout = AnalogueReadout(Analogues.of(primitive), follow, torch.zeros(5, 5, 5), torch.ones(5, 5, 3))
     assert readout.together(torch.tensor([True, False, False, False, False])).tolist() == [True] * 3 + [False] * 2
+
+
+def test_an_empty_batch_is_no_error() -> None:
+    primitive = small_primitive()
+    filter = bent(primitive, weigh=True)
+    state = filter(torch.zeros(0, 4, primitive.layout.n_dofs)).state
+    for ahead in ([], [0.1, END]):
+        assert filter.forecast(state, ahead=ahead).mean.shape == (0, len(ahead), primitive.layout.n_dofs)
+    assert filter.attribution(state).shape == (0, len(primitive))
 
 
 def test_no_horizons_are_no_error() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,11 +25,15 @@ from torch_ebip import (
     learn,
     particle_filter,
 )
-from torch_ebip.interaction import AnalogueReadout
+from torch_ebip.interaction import AnalogueReadout, Analogues
+from torch_ebip.interaction.analogues import Analogy
+from torch_ebip.interaction.present import Present
 from torch_ebip.learning import InteractionModel
+from torch_ebip.learning.analogues import fit_analogues, learn_stacking, moments_of
 from torch_ebip.learning.configuration import Task
 from torch_ebip.learning.held_out import HeldOut, Trial
 from torch_ebip.learning.recently import recent_sums
+from torch_ebip.learning.said import what_it_says
 from torch_ebip.learning.stacking import FIXED, PULLS, best_correction, best_width
 
 QUICK = {"steps": 0, "scan": 6}
@@ -121,6 +126,42 @@ def test_few_demonstrations_have_none_and_the_report_says_so() -> None:
     model = learn(interactions(12), steps=0, scan=4)
     assert not isinstance(model.filter.readout, AnalogueReadout)
     assert any("no analogues: 12 demonstrations, 20" in remark for remark in model.report["remarks"])
+
+
+def test_what_analogues_are_worth_is_asked_of_those_who_did_not_see_it() -> None:
+    """Nonsense in a fold changes every kernel but the one that says what analogues are worth there."""
+    known = bending(24)
+    primitive = InteractionPrimitive.fit(known)
+    filter, targets = made(primitive), primitive.layout.controlled
+    objective = ForecastObjective(primitive, targets, ahead=[0.1, math.inf])
+    held_out = HeldOut(known, Task(primitive, objective, targets, {"all": ~targets}), TuningSettings(folds=3))
+    with torch.no_grad():
+        said = what_it_says(held_out, filter, torch.arange(24), moments_of(held_out))
+    fold = held_out.partition.fold_of[said.interaction]
+    nonsense = torch.where((fold == 1).view(-1, 1, 1, 1), 9 - said.wanted, said.wanted)
+    found = []
+    for wanted in (said.wanted, nonsense):
+        analogues = Analogues.of(primitive)
+        found.append([*fit_analogues(analogues, held_out, said._replace(wanted=wanted)), analogues])
+    same = [torch.equal(a.relevance.raw, b.relevance.raw) for a, b in zip(*found, strict=True)]
+    assert same == [False, True, False, False]
+    noting = [Noting.of(primitive) for _ in range(3)]
+    learn_stacking(held_out, found[0][-1], noting, said, torch.arange(24))
+    for f, each in enumerate(noting):
+        torch.testing.assert_close(torch.cat(each.asked), said.present.phase[fold == f])
+
+
+class Noting(Analogues):
+    """Remembers the phases that it is asked about."""
+
+    def __init__(self, *parts: Any) -> None:
+        super().__init__(*parts)
+        self.asked: list[torch.Tensor] = []
+
+    def forward(self, present: Present) -> Analogy:
+        """See `Analogues.forward`."""
+        self.asked.append(present.phase)
+        return super().forward(present)
 
 
 def test_a_correction_is_ridge_regression_judged_by_folds() -> None:

@@ -110,6 +110,17 @@ def as_seconds(dt: Any, like: Tensor) -> Tensor:
     return step
 
 
+def check_clocks(step: Tensor, batch: Sequence[int]) -> None:
+    """Steps of time [...] must be one number, or one for each entry of a ``batch``.
+
+    Raises:
+        ValueError: they are more, or others.
+    """
+    rows = tuple(batch)[max(len(batch) - step.ndim, 0) :]
+    if step.ndim > len(batch) or any(n not in (1, b) for n, b in zip(step.shape, rows, strict=True)):
+        raise ValueError(f"dt must be a number, or one for each of a batch {list(batch)}, got {list(step.shape)}")
+
+
 def as_mask(name: str, value: Any, length: int) -> Tensor:
     """bool [length] on the CPU, of a tensor, an array or a list of booleans.
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal, TypeAlias
 from torch import Tensor, nn
 
 from torch_ebip.common.ambient import eager
-from torch_ebip.common.arguments import as_count, as_seconds
+from torch_ebip.common.arguments import as_count, as_seconds, check_clocks
 from torch_ebip.common.draws import Generators
 from torch_ebip.common.meaning import Meaning
 from torch_ebip.common.modules import sharing
@@ -167,9 +167,12 @@ class Filter(Meaning, ABC):
             generator: of the draws.
 
         Raises:
-            ValueError: a dt that is negative, NaN or infinite.
+            ValueError: a dt that is negative, NaN or infinite, or not of the batch.
         """
-        return self._predict(usable(state), as_seconds(dt, state[0]), generator)
+        step = as_seconds(dt, state[0])
+        if step.ndim:
+            check_clocks(step, state.mean.shape[:-1])
+        return self._predict(usable(state), step, generator)
 
     @eager
     def update(
@@ -249,6 +252,7 @@ class Filter(Meaning, ABC):
             raise ValueError(f"the state's batch does not begin with {list(batch)}: {list(state[0].shape)}")
         state = usable(state)
         step = as_seconds(self.dt if dt is None else dt, state[0])
+        check_clocks(step, batch)
         if engine not in ("auto", "dense", "span"):
             raise ValueError(f'engine must be "auto", "dense" or "span", got {engine!r}')
         if engine != "dense":

@@ -15,11 +15,13 @@ import torch
 from torch import Tensor, nn
 
 from torch_ebip.common.ambient import outside_inference, owned
+from torch_ebip.common.arguments import as_number
 from torch_ebip.common.brief import brief
 from torch_ebip.common.modules import sharing
 from torch_ebip.filtering.noise.constraints import Positive, Signed
 from torch_ebip.filtering.protocols import View
 from torch_ebip.filtering.updates.recent import Line
+from torch_ebip.interaction.compared import Compared, compared_of
 from torch_ebip.interaction.present import Present
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.interaction.readout import Lead
@@ -29,14 +31,14 @@ START = (60.0, 6.0)
 """Relevance of value and velocity at the start, of all sensors together."""
 MEMORY = 0.27
 """Power of the filter's weights at the start."""
-FAR = 5.0
-"""Deviations beyond which all is equally far."""
 LEAST = 0.012
 """Deviation of the phase that is never gone below: half of what lies between the phases of the table."""
 REACH = 5.0
 """Deviations of the phase beyond which a pair has no say."""
 LEAST_SAY = 1e-9
 """Weight of a demonstration from which it is asked where it would be."""
+UNLIKE = 0.1
+"""Analogues that the chance counts for that an interaction is like none: 1 in 11 where one has all weight."""
 PORTION = 1 << 24
 """Numbers that are held at once."""
 
@@ -47,31 +49,12 @@ class Analogy(NamedTuple):
     Attributes:
         weights: [..., N], summing to 1.
         phase: [..., N], where each of them would be.
+        wide: [..., N], summing to 1, by which a forecast is as wide as it is: some of it is of all alike.
     """
 
     weights: Tensor
     phase: Tensor
-
-    def __repr__(self) -> str:
-        return brief(self)
-
-
-class _Constants(NamedTuple):
-    """What depends on the demonstrations alone.
-
-    Attributes:
-        bank: [P, N, 4 k], f^2 and f of every pair, values before velocities.
-        middle, inverse, moved: [2, k], what is taken off, 1 / scale, and whether a DoF moves at all, 0 or 1.
-        sensors: [k, S], 1 where a DoF is a sensor's.
-        places: [P], phases.
-    """
-
-    bank: Tensor
-    middle: Tensor
-    inverse: Tensor
-    moved: Tensor
-    sensors: Tensor
-    places: Tensor
+    wide: Tensor
 
     def __repr__(self) -> str:
         return brief(self)
@@ -93,9 +76,12 @@ class Analogues(nn.Module):
         scale: [2, D], deviations of values and velocities over the demonstrations, units of the DoFs, and a second.
         modality_of_dof: int64 [D].
         compared: bool [D], the DoFs that are.
+        unlike: u, above or equal to 0: with n analogues that count (1 / sum w^2), the interaction is like none of
+            them with chance u / (u + n), and a forecast as wide as that makes it. Without it one that holds all
+            weight would be sure of all it says.
 
     Raises:
-        ValueError: shapes that do not fit; no DoF that is compared.
+        ValueError: shapes that do not fit; no DoF that is compared; a negative u.
 
     Example:
         >>> import torch
@@ -113,9 +99,16 @@ class Analogues(nn.Module):
     rows: Tensor
 
     def __init__(
-        self, table: DemonstrationTable, pace: Tensor, scale: Tensor, modality_of_dof: Tensor, compared: Tensor
+        self,
+        table: DemonstrationTable,
+        pace: Tensor,
+        scale: Tensor,
+        modality_of_dof: Tensor,
+        compared: Tensor,
+        unlike: float = UNLIKE,
     ) -> None:
         super().__init__()
+        self.unlike = as_number("unlike", unlike, 0)
         N, _, _, D = table.cells.shape
         if pace.shape != (N,) or scale.shape != (2, D) or modality_of_dof.shape != (D,) or compared.shape != (D,):
             raise ValueError(
@@ -137,15 +130,16 @@ class Analogues(nn.Module):
         self.tilt = Signed(scale.new_zeros(2))
         self.memory = Positive(scale.new_tensor(MEMORY))
         self.looseness = Positive(scale.new_tensor(1.0))
-        self._kept: tuple[list[tuple[Tensor, int]], _Constants] | None = None
+        self._kept: tuple[list[tuple[Tensor, int]], Compared] | None = None
 
     @classmethod
-    def of(cls, primitive: InteractionPrimitive, compared: Tensor | None = None) -> Analogues:
+    def of(cls, primitive: InteractionPrimitive, compared: Tensor | None = None, unlike: float = UNLIKE) -> Analogues:
         """Those of a primitive's demonstrations.
 
         Args:
             primitive: of the demonstrations.
             compared: bool [D]; default: the DoFs that are not controlled.
+            unlike: see `Analogues`.
         """
         layout, weights = primitive.layout, primitive.weights
         table = DemonstrationTable.of(primitive)
@@ -153,9 +147,9 @@ class Analogues(nn.Module):
         pace = primitive.phase_velocity
         velocity = table.slopes * pace[:, None, None]
         scale = torch.stack([primitive.value_variance.clamp(min=0).sqrt(), velocity.flatten(0, 1).std(0)])
-        return cls(table, pace, scale.to(weights), layout.modality_of_dof, compared)
+        return cls(table, pace, scale.to(weights), layout.modality_of_dof, compared, unlike)
 
-    def _constants(self) -> _Constants:
+    def _compared(self) -> Compared:
         """Kept while what they are made of stays as it is."""
         sources = (self.table.cells, self.pace, self.scale)
         versions = [(source, -1 if source.is_inference() else source._version) for source in sources]
@@ -164,21 +158,9 @@ class Analogues(nn.Module):
             ours is not theirs or now != then or now < 0
             for (ours, now), (theirs, then) in zip(versions, kept[0], strict=True)
         ):
-            self._kept = kept = versions, self._computed()
-        return _Constants(*(outside_inference(part) for part in kept[1]))
-
-    def _computed(self) -> _Constants:
-        values = self.table.values[..., self.dofs]
-        velocities = self.table.slopes[..., self.dofs] * self.pace[:, None, None]
-        middle = torch.stack([values.mean((0, 1)), torch.zeros_like(values[0, 0])])
-        moved = (self.scale > 0) & (self.scale[:1] > 0)  # what stands still has a velocity of rounding alone
-        inverse = torch.where(moved, 1 / torch.where(moved, self.scale, 1), 0)
-        both = (torch.stack([values, velocities], -2) - middle) * inverse
-        flat = both.clamp(-FAR, FAR).flatten(-2).transpose(0, 1)
-        sensors = nn.functional.one_hot(self.modality_of_dof).to(values)
-        places = torch.linspace(0, 1, values.shape[1], dtype=values.dtype, device=values.device)
-        bank = torch.cat([flat.square(), flat], -1).contiguous()
-        return _Constants(bank, middle, inverse, moved.to(values), sensors, places)
+            made = compared_of(self.table, self.pace, self.scale, self.dofs, self.modality_of_dof)
+            self._kept = kept = versions, made
+        return Compared(*(outside_inference(part) for part in kept[1]))
 
     def forward(self, present: Present) -> Analogy:
         """Which demonstrations the present [...] is like; differentiable.
@@ -196,19 +178,18 @@ class Analogues(nn.Module):
         )
         rows = max(1, PORTION // (P * N))
         parts = [self._weigh(flat, slice(i, i + rows)) for i in range(0, max(len(flat.phase), 1), rows)]
-        weights, phase = (torch.cat(each).reshape(*batch, N) for each in zip(*parts, strict=True))
-        return Analogy(weights, phase)
+        return Analogy(*(torch.cat(each).reshape(*batch, N) for each in zip(*parts, strict=True)))
 
     def _weigh(self, present: Present, rows: slice) -> Analogy:
         """Of some rows of a flat batch."""
         phase, prior = present.phase[rows].clamp(0, 1), present.prior[rows]
-        constants = self._constants()
-        bank, places = constants.bank, constants.places
+        compared = self._compared()
+        bank, places = compared.bank, compared.places
         variance = (present.variance[rows] * self.looseness.value.square()).clamp(min=LEAST**2)
         near = _reached(phase, variance, len(places))
         bank, places = bank[near], places[near]
         P, N, _ = bank.shape
-        x, shares = self._seen(Line(*(part[rows] for part in present.line)), constants)
+        x, shares = compared.seen(Line(*(part[rows] for part in present.line)), self.dofs)
         late = (phase - 0.5).unsqueeze(-1) * self.tilt.value
         shares = shares * (self.relevance.value * late.exp().unsqueeze(-1))  # [R, 2, k]
         # c (x - f)^2 without c x^2, which all pairs have in common.
@@ -223,19 +204,10 @@ class Analogues(nn.Module):
         # The quotient of what has next to no say has a gradient without bounds.
         some = each > LEAST_SAY
         where = (places @ weights) / torch.where(some, each, 1)
-        return Analogy(each, torch.where(some, where, phase.unsqueeze(-1)))
-
-    def _seen(self, line: Line, constants: _Constants) -> tuple[Tensor, Tensor]:
-        """x and c [R, 2, k] of lines."""
-        belief = line.belief
-        parts = torch.stack([line.value, line.velocity, belief, belief * line.moves], -2).index_select(-1, self.dofs)
-        x = ((parts[..., :2, :] - constants.middle) * constants.inverse).clamp(-FAR, FAR)
-        here = parts[..., 2:, :] * constants.moved
-        total = here @ constants.sensors @ constants.sensors.T  # of each DoF's sensor
-        # Of a sensor whose DoFs are all believed alike each has an equal share, together as much as one is believed.
-        # Parts are squared, not what is believed, whose square is 0 long before it is.
-        part = here / torch.where(total > 0, total, 1)
-        return x, here * (part.square() @ constants.sensors @ constants.sensors.T)
+        where = torch.where(some, where, phase.unsqueeze(-1))
+        even = there.to(each) / there.sum(-1, keepdim=True)
+        alone = self.unlike * each.square().sum(-1, keepdim=True)
+        return Analogy(each, where, torch.lerp(each, even, alone / (1 + alone)))
 
     def forecast(self, analogy: Analogy, lead: Lead) -> tuple[Tensor, Tensor]:
         """Mean and variance [..., P, D] of what came of them: each at its own pace where seconds were asked for.
@@ -254,9 +226,8 @@ class Analogues(nn.Module):
         which = torch.arange(N, device=at.device).expand(at.shape[:-1])
         whole = len(self.rows) == self.table.n_dofs
         paths = self.table.at(which, at, None if whole else self.rows)  # [..., N, P, D]
-        weights = analogy.weights[..., None, None]
-        mean = (weights * paths).sum(-3)
-        return mean, (weights * (paths - mean.unsqueeze(-3)).square()).sum(-3)
+        mean = (analogy.weights[..., None, None] * paths).sum(-3)
+        return mean, (analogy.wide[..., None, None] * (paths - mean.unsqueeze(-3)).square()).sum(-3)
 
     def select(self, view: View) -> Analogues:
         """The same for a view of the model: forecasts of its DoFs; what is compared stays."""
@@ -269,8 +240,8 @@ class Analogues(nn.Module):
         return {**self.__dict__, "_kept": None}
 
     def meant(self) -> str:
-        """What its tensors mean, see `Meaning`: nothing beside themselves."""
-        return ""
+        """What its tensors mean, see `Meaning`."""
+        return f"unlike={self.unlike:g}"
 
     def extra_repr(self) -> str:
         """Sizes."""
@@ -282,6 +253,8 @@ def _reached(phase: Tensor, variance: Tensor, count: int) -> slice:
     """Those of ``count`` phases that are within `REACH` of some phase [R]."""
     reach = REACH * variance.detach().sqrt()
     phase = phase.detach()
+    if not len(phase):
+        return slice(0, count)
     low, high = float((phase - reach).min()), float((phase + reach).max())
     if not (math.isfinite(low) and math.isfinite(high)):
         return slice(0, count)

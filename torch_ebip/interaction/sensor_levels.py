@@ -100,7 +100,7 @@ class SensorLevels(Surprise):
         self.register_buffer("known", torch.zeros(S, dtype=torch.bool, device=mean.device))
         self.register_buffer("bounds", torch.stack([mean.new_zeros(S), mean.new_ones(S)]))
         self.most_dofs = int(same.sum(1).max())
-        self._kept: tuple[Tensor, int, Tensor] | None = None
+        self._kept: tuple[Tensor, int, tuple[float, ...], Tensor] | None = None
 
     @property
     def n_sensors(self) -> int:
@@ -128,9 +128,10 @@ class SensorLevels(Surprise):
         if dt.requires_grad or dt.is_inference() or torch.is_inference_mode_enabled():
             return SurpriseMemory(memory.kept * self._left(dt))
         kept = self._kept  # another thread may exchange it
-        if kept is None or kept[0] is not dt or kept[1] != dt._version:
-            self._kept = kept = dt, dt._version, self._left(dt)
-        return SurpriseMemory(memory.kept * kept[2])
+        spans = self.window, self.bias_window, self.memory
+        if kept is None or kept[0] is not dt or kept[1:3] != (dt._version, spans):
+            self._kept = kept = dt, dt._version, spans, self._left(dt)
+        return SurpriseMemory(memory.kept * kept[3])
 
     def _left(self, dt: Tensor) -> Tensor:
         """[..., S + 1, 6 + m], what is left after dt [...] s, as a share."""

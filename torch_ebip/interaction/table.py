@@ -106,7 +106,7 @@ class DemonstrationTable(nn.Module):
         cell = place.detach().floor().clamp(max=P - 1)
         t = (place - cell).unsqueeze(-1)
         rows = torch.add(cell.long(), demonstrations.unsqueeze(-1), alpha=P)
-        found = cells.reshape(N * P, -1).index_select(0, rows.reshape(-1)).view(*rows.shape, 4, -1)
+        found = cells.reshape(N * P, -1).index_select(0, rows.reshape(-1)).view(*rows.shape, 4, cells.shape[-1])
         constant, linear, square, cube = found.unbind(-2)
         return torch.addcmul(constant, t, torch.addcmul(linear, t, torch.addcmul(square, t, cube)))
 

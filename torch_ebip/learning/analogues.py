@@ -1,12 +1,15 @@
 """What near means to analogues, and how much they count beside the filter: from interactions left out.
 
 The parameters of the kernel are few, and tuned by gradient on what the analogues alone say of interactions that are
-none of them. They are the same for all sets of sensors that are shown, so that they serve others, too.
+none of them. They are the same for all sets of sensors that are shown, so that they serve others, too. What analogues
+are worth is asked of kernels that were tuned without the interactions that are asked about, fold by fold.
 """
 
 from __future__ import annotations
 
+import copy
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -49,18 +52,33 @@ def moments_of(held_out: HeldOut) -> Tensor:
 
 
 @without_autocast
-def fit_analogues(analogues: Analogues, held_out: HeldOut, said: Said) -> None:
+def fit_analogues(analogues: Analogues, held_out: HeldOut, said: Said) -> list[Analogues]:
     """Tune the kernel of analogues over all targets.
 
     Args:
         analogues: changed.
         held_out: the demonstrations, and what is asked of them: seconds ahead.
         said: by a filter that remembers what was seen of late; by what it knew of the present.
+
+    Returns:
+        For each fold the same, tuned without it.
     """
+    fold = _fold_of(held_out, said)
+    without = [copy.deepcopy(analogues) for _ in range(held_out.settings.folds)]
+    for f, each in enumerate(without):
+        _tune(each, held_out, said, fold != f)
+    _tune(analogues, held_out, said, torch.ones_like(fold, dtype=torch.bool))
+    return without
+
+
+def _tune(analogues: Analogues, held_out: HeldOut, said: Said, some: Tensor) -> None:
+    """Tune a kernel on ``some``, bool [R], of what was said."""
     assert said.present is not None
+    if not bool(some.any()):  # a fold that holds all: it is as it was
+        return
     scale, head = held_out.task.objective.scale, _of_targets(held_out, analogues)
-    truth = (said.wanted + said.mean).flatten(0, 1)  # [RK, P, D], units of the scale
-    present: Present = map_state(lambda part: part.flatten(0, 1), said.present)
+    truth = (said.wanted + said.mean)[some].flatten(0, 1)  # [RK, P, D], units of the scale
+    present: Present = map_state(lambda part: part[some].flatten(0, 1), said.present)
     lead = _lead(held_out)
     often = (~truth.isnan()).to(scale).mean((0, 2)).clamp(min=1e-6)
     # Between them the variance of the analogues becomes one of forecasts; not kept.
@@ -71,9 +89,9 @@ def fit_analogues(analogues: Analogues, held_out: HeldOut, said: Said) -> None:
     for step in range(STEPS):
         optimiser.param_groups[0]["lr"] = RATE * 0.5 * (1 + math.cos(math.pi * step / STEPS)) + 0.03 * RATE
         rows = torch.randint(len(truth), (ROWS,), generator=draws, device="cpu").to(truth.device)
-        some: Present = map_state(lambda part, rows=rows: part[rows], present)
+        now: Present = map_state(lambda part, rows=rows: part[rows], present)
         with torch.enable_grad():
-            mean, variance = head.forecast(head(some), lead)
+            mean, variance = head.forecast(head(now), lead)
             mean, variance = mean / scale, variance / scale.square()
             measured = ~truth[rows].isnan()
             error = torch.where(measured, truth[rows], mean.detach()) - mean
@@ -92,21 +110,27 @@ def fit_analogues(analogues: Analogues, held_out: HeldOut, said: Said) -> None:
 @without_autocast
 @torch.no_grad()
 def learn_stacking(
-    held_out: HeldOut, analogues: Analogues, said: Said, scored: Tensor, corrected: bool = True
+    held_out: HeldOut,
+    analogues: Analogues,
+    without: Sequence[Analogues],
+    said: Said,
+    scored: Tensor,
+    corrected: bool = True,
 ) -> Drawn:
     """How analogues are corrected by the filter and the mean, and how wide all together are.
 
     Args:
         held_out: the demonstrations, and what is asked of them: seconds ahead.
-        analogues: as they are.
+        analogues: as they will be used.
+        without: the same tuned without each fold, which say what they are worth there, see `fit_analogues`.
         said: by the filter, without a read-out, of the interactions that decide.
         scored: int64 [S], those among them whose scores are told.
         corrected: otherwise analogues speak alone.
     """
     layout, objective, targets, ahead, names = asked_of(held_out)
     scale = objective.scale
-    theirs, spread = _say(held_out, analogues, said)
-    fold = held_out.partition.fold_of.to(theirs.device)[said.interaction]
+    fold = _fold_of(held_out, said)
+    theirs, spread = _say(held_out, without, said, fold)
     modality = layout.modality_of_dof.to(theirs.device)
     S, D, V, J = said.place.shape[-1], layout.n_dofs, len(VOICES), said.level.shape[-1]
     follow = torch.eye(D, dtype=theirs.dtype, device=theirs.device).repeat(S, J, 1, 1)  # [S, J, D, D]
@@ -142,17 +166,23 @@ def learn_stacking(
     return drawn_of(held_out, said, scored, readout, shares, drawn, deviation)
 
 
-def _say(held_out: HeldOut, analogues: Analogues, said: Said) -> tuple[Tensor, Tensor]:
-    """What analogues say less the mean, and their deviation, [R, K, P, D] of the targets, in units of the scale."""
-    head, lead, present = _of_targets(held_out, analogues), _lead(held_out), said.present
-    scale = held_out.task.objective.scale
-    rows = max(1, PORTION // (said.place[0, ..., 0].numel() * len(analogues.pace) * scale.shape[-1]))
-    parts = []
-    for i in range(0, len(said.interaction), rows):
-        some: Present = map_state(lambda part, i=i: part[i : i + rows], present)
-        parts.append(head.forecast(head(some), lead))
-    mean, variance = (torch.cat(each) for each in zip(*parts, strict=True))
+def _say(held_out: HeldOut, without: Sequence[Analogues], said: Said, fold: Tensor) -> tuple[Tensor, Tensor]:
+    """What analogues say less the mean, and their deviation, [R, K, P, D] of the targets, in units of the scale;
+    of each fold [R] those that were tuned without it."""
+    lead, scale = _lead(held_out), held_out.task.objective.scale
+    portion = max(1, PORTION // (said.place[0, ..., 0].numel() * len(without[0].pace) * scale.shape[-1]))
+    mean, variance = torch.empty_like(said.mean), torch.empty_like(said.mean)
+    for f, analogues in enumerate(without):
+        head = _of_targets(held_out, analogues)
+        for rows in torch.split((fold == f).nonzero().squeeze(-1), portion):
+            present: Present = map_state(lambda part, rows=rows: part[rows], said.present)
+            mean[rows], variance[rows] = head.forecast(head(present), lead)
     return mean / scale - said.mean, variance.clamp(min=0).sqrt() / scale
+
+
+def _fold_of(held_out: HeldOut, said: Said) -> Tensor:
+    """int64 [R], of what was said."""
+    return held_out.partition.fold_of.to(said.interaction.device)[said.interaction]
 
 
 def _of_targets(held_out: HeldOut, analogues: Analogues) -> Analogues:

@@ -252,7 +252,8 @@ def _describe_readout(readout: Readout | None) -> Any:
         seconds = [s if math.isfinite(s) else "end" for s in readout.seconds.tolist()]
         if isinstance(readout, AnalogueReadout):
             compared = readout.analogues.dofs.tolist()
-            return {"seconds": seconds, "levels": readout.levels.tolist(), "compared": compared}
+            analogues = {"compared": compared, "unlike": readout.analogues.unlike}
+            return {"seconds": seconds, "levels": readout.levels.tolist(), **analogues}
         return {"seconds": seconds, "levels": readout.levels.tolist()}
     if isinstance(readout, Shrinkage):
         return readout.leads.tolist()
@@ -268,7 +269,7 @@ def _readout_of(description: Any, primitive: InteractionPrimitive) -> Readout:
     if "compared" in description:
         compared = torch.zeros(D, dtype=torch.bool, device="cpu")
         compared[description["compared"]] = True
-        analogues = Analogues.of(primitive, compared)
+        analogues = Analogues.of(primitive, compared, description.get("unlike", 0.0))  # before version 6: never
         K, levels = len(seconds), description.get("levels", [1.0])  # before version 5: one
         follow, correct = ones(K, D, len(levels) * D), ones(K, D, D)
         return AnalogueReadout(analogues, follow, correct, ones(K, D, len(VOICES)), seconds, levels)

@@ -78,8 +78,8 @@ def learn_readout(
     if analogues is not None:
         shown = torch.stack(list(task.subsets.values())).any(0)
         head = analogues(task.primitive, shown)
-        fit_analogues(head, held_out, said)
-        stacked = learn_stacking(held_out, head, said, scored, corrected)
+        without = fit_analogues(head, held_out, said)
+        stacked = learn_stacking(held_out, head, without, said, scored, corrected)
         scores["analogues"] = stacked.scores
         used = not choose or stacked.scores["crps"] < drawn.scores["crps"]
         told["analogues"] = {"used": used, "shares": stacked.shares, "crps": round(stacked.scores["crps"], 5),

@@ -89,7 +89,7 @@ class Recent(Part):
         self.window = as_number("window", window, 0, above=True)
         self.register_buffer("centre", owned(centre))
         self.register_buffer("columns", torch.arange(len(centre), device=centre.device), persistent=False)
-        self._kept: tuple[Tensor, int, Tensor] | None = None
+        self._kept: tuple[Tensor, int, float, Tensor] | None = None
 
     def check(self, model: StateSpace) -> None:
         """See `Part.check`: it is for as many DoFs as the model has."""
@@ -117,9 +117,9 @@ class Recent(Part):
         if dt.requires_grad or dt.is_inference() or torch.is_inference_mode_enabled():
             return self._ageing(dt) @ sums
         kept = self._kept  # another thread may exchange it
-        if kept is None or kept[0] is not dt or kept[1] != dt._version:
-            self._kept = kept = dt, dt._version, self._ageing(dt)
-        return kept[2] @ sums
+        if kept is None or kept[0] is not dt or kept[1:3] != (dt._version, self.window):
+            self._kept = kept = dt, dt._version, self.window, self._ageing(dt)
+        return kept[3] @ sums
 
     def _ageing(self, dt: Tensor) -> Tensor:
         """[..., 5, 5]: (t - dt)^k in powers of t, times what is left after dt [...] s."""

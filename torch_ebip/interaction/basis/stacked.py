@@ -280,7 +280,8 @@ class StackedBasis(nn.Module):
 
 def _select(block: Tensor, run: _Run, wanted: list[int]) -> Tensor:
     """Weights [..., k, B] of some DoFs of a run, whose are [..., n_weights of the run]: a view for neighbours."""
-    block = block.reshape(*block.shape[:-1], run.dofs.stop - run.dofs.start, -1)
+    count = run.dofs.stop - run.dofs.start
+    block = block.reshape(*block.shape[:-1], count, block.shape[-1] // count)
     first, count = wanted[0], len(wanted)
     if wanted == list(range(first, first + count)):
         return block.narrow(-2, first, count)
