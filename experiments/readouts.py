@@ -52,7 +52,11 @@ def held_out_of(fold: Fold, subsets: Mapping[str, Tensor] | None = None) -> Held
 
 
 def with_readout(
-    fold: Fold, makes: Makes | None, alone: bool = False, subsets: Mapping[str, Tensor] | None = None
+    fold: Fold,
+    makes: Makes | None,
+    alone: bool = False,
+    expert: bool = False,
+    subsets: Mapping[str, Tensor] | None = None,
 ) -> InteractionEnsembleFilter:
     """The filter that `learn` made of a fold, with another read-out.
 
@@ -60,6 +64,7 @@ def with_readout(
         fold: the training part.
         makes: its analogues; None for none.
         alone: whether analogues speak without the filter and the mean.
+        expert: whether one is heard beside them, where it pays.
         subsets: sets of sensors, bool [D] by name, that it is learned from; default: all.
     """
     filter = copy.deepcopy(fold.model().filter)
@@ -69,7 +74,9 @@ def with_readout(
     held_out = held_out_of(fold, subsets)
     partition = held_out.partition
     some = partition.order[: max(DECIDING, len(partition.validating))]
-    learn_readout(held_out, filter, some, partition.validating, makes, choose=False, corrected=not alone)
+    learn_readout(
+        held_out, filter, some, partition.validating, makes, choose=False, corrected=not alone, expert=expert
+    )
     filter.analysis.surprise, filter.doubt, filter.bounds = surprise, doubt, bounds
     return filter
 
@@ -89,7 +96,10 @@ class UnseenMethod:
         if len(masks) < 2:
             raise ValueError(f"no other set of sensors to learn from: there is only {', '.join(masks)}")
         self._methods = [
-            (mask.cpu(), FilterMethod(with_readout(fold, _analogues, subsets=_others(masks, name)), fold.seed))
+            (
+                mask.cpu(),
+                FilterMethod(with_readout(fold, _analogues, expert=True, subsets=_others(masks, name)), fold.seed),
+            )
             for name, mask in masks.items()
         ]
 
@@ -119,9 +129,10 @@ READOUTS: dict[str, Callable[[Fold], FilterMethod | UnseenMethod]] = {
     "readout_alone": partial(_method, partial(with_readout, makes=_analogues, alone=True)),
     "readout_no_memory": partial(_method, partial(with_readout, makes=Forgetful.of)),
     "readout_no_phase": partial(_method, partial(with_readout, makes=Timeless.of)),
+    "readout_no_expert": partial(_method, partial(with_readout, makes=_analogues)),
     "readout_unseen": UnseenMethod,
-    "readout_again": partial(_method, partial(with_readout, makes=_analogues)),
+    "readout_again": partial(_method, partial(with_readout, makes=_analogues, expert=True)),
 }
 """Builders: drawn towards the mean alone; analogues without the filter; without the evidence; without the filter's
-phase; learned without the set of sensors that is asked about; as it is, learned anew, of a filter that was learned
-before."""
+phase; without the expert; learned without the set of sensors that is asked about; as it is, learned anew, of a filter
+that was learned before."""

@@ -103,13 +103,23 @@ def test_a_view_writes_into_the_memory_of_all() -> None:
     assert recent.line(narrower.learn(sums, seen(torch.tensor([4.0])))).value.tolist() == [0, 4.0, 0, 2.0]
 
 
-def test_another_window_is_noticed() -> None:
-    """Also where the step of time is the same tensor as before."""
-    recent, sums, dt = Recent(torch.zeros(1)), torch.ones(5, 1), torch.tensor(0.01)
-    before = recent.forget(sums, dt)
-    recent.window = 10 * recent.window
-    assert torch.equal(recent.forget(sums, dt), Recent(torch.zeros(1), recent.window).forget(sums, dt))
-    assert not torch.equal(recent.forget(sums, dt), before)
+def test_several_windows_remember_what_each_would_alone() -> None:
+    """Also with clocks of each entry, and what was not seen."""
+    draws = torch.Generator().manual_seed(0)
+    windows = (0.03, 0.2, 1.0)
+    together, apart = Recent(torch.ones(3), *windows[:1], windows[1:]), [Recent(torch.ones(3), w) for w in windows]
+    all_sums, each = together.start(torch.zeros(2, 1, 1)), [part.start(torch.zeros(2, 1, 1)) for part in apart]
+    for _ in range(40):
+        dt = 0.05 * torch.rand(2, generator=draws)
+        sample = seen(torch.randn(2, 3, generator=draws), torch.rand(2, 3, generator=draws) > 0.3)
+        all_sums = together.learn(together.forget(all_sums, dt), sample)
+        each = [part.learn(part.forget(sums, dt), sample) for part, sums in zip(apart, each, strict=True)]
+    lines = together.lines(all_sums)
+    for w, (part, sums) in enumerate(zip(apart, each, strict=True)):
+        for ours, theirs in zip(lines, part.line(sums), strict=True):
+            torch.testing.assert_close(ours[:, w], theirs)
+    for ours, theirs in zip(together.line(all_sums), lines, strict=True):
+        torch.testing.assert_close(ours, theirs[:, 0])
 
 
 def test_entries_of_a_batch_have_clocks_of_their_own() -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 
 from torch_ebip import InteractionPrimitive, ebip
 from torch_ebip.interaction import InteractionEnsembleFilter
 from torch_ebip.interaction.analogue_readout import AnalogueReadout
 from torch_ebip.interaction.analogues import Analogues
+from torch_ebip.interaction.expert import SLOWER, Expert, Layers
 from torch_ebip.interaction.horizons import LEVELS
 from torch_ebip.interaction.present import recent_of
 
@@ -31,4 +34,24 @@ def bent(primitive: InteractionPrimitive, **options: object) -> InteractionEnsem
             parameter.add_(0.3 * torch.randn(parameter.shape, generator=draws).to(parameter))
     parts = (follow.transpose(1, 2).flatten(-2), correct, width)
     filter.readout = AnalogueReadout(analogues, *(part.to(like) for part in parts), levels=LEVELS)
+    return filter
+
+
+def heard(
+    primitive: InteractionPrimitive, slower: Sequence[float] = SLOWER, **options: object
+) -> InteractionEnsembleFilter:
+    """The same with an expert, of random numbers, that reads the sensors and speaks of the controlled DoFs."""
+    filter = bent(primitive, **options)
+    filter.analysis.recent = recent_of(primitive, slower=slower)
+    draws, controlled, D = torch.Generator().manual_seed(1), primitive.layout.controlled, primitive.layout.n_dofs
+    expert = Expert.of(primitive, ~controlled, controlled, hidden=8)
+    for name, part in expert.named_buffers(recurse=False):
+        if name in Layers._fields or name in ("middle", "centre"):
+            part.copy_(0.3 * torch.randn(part.shape, generator=draws).to(part))
+        elif name in ("scale", "unit"):
+            part.copy_(0.5 + torch.rand(part.shape, generator=draws).to(part))
+    heed = torch.where(controlled.unsqueeze(-1), torch.rand(5, D, len(LEVELS), generator=draws), 0)
+    bending = filter.readout
+    parts = (bending.analogues, bending.follow, bending.correct, bending.width)
+    filter.readout = AnalogueReadout(*parts, levels=LEVELS, expert=expert, heed=heed.to(primitive.weights))
     return filter

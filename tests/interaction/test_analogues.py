@@ -46,7 +46,7 @@ def present_of(primitive: InteractionPrimitive, seed: int = 0) -> Present:
     belief[0, 1], belief[1, 0], belief[2] = 0.4, 0.0, 0.0
     moves = torch.tensor([[True] * D, [False] * D, [True] * D])
     value, velocity = (torch.tensor(draws.standard_normal((3, D))) for _ in range(2))
-    line = Line(value, velocity, belief, moves)
+    line = Line(value, velocity, belief, moves, torch.zeros_like(value))
     return Present(
         torch.tensor([0.3, 0.62, 0.9]).double(), torch.tensor([0.003, 0.0, 0.01]).double(), weights.log(), line
     )
@@ -146,7 +146,9 @@ def test_what_is_exactly_there_is_found() -> None:
     velocity = (
         primitive.basis.project_derivative(phase.expand(24), primitive.weights) * primitive.phase_velocity[:, None]
     )
-    line = Line(value, velocity, torch.ones_like(value), torch.ones_like(value, dtype=torch.bool))
+    line = Line(
+        value, velocity, torch.ones_like(value), torch.ones_like(value, dtype=torch.bool), torch.zeros_like(value)
+    )
     even = torch.full((24, 24), -math.log(24), dtype=torch.float64)
     found = analogues(Present(phase.expand(24), torch.full((24,), 0.01).double(), even, line))
     assert (found.weights.argmax(-1) == torch.arange(24)).all()

@@ -29,7 +29,7 @@ from torch_ebip.interaction import AnalogueReadout, Analogues
 from torch_ebip.interaction.analogues import Analogy
 from torch_ebip.interaction.present import Present
 from torch_ebip.learning import InteractionModel
-from torch_ebip.learning.analogues import fit_analogues, learn_stacking, moments_of
+from torch_ebip.learning.analogues import fit_analogues, moments_of, what_analogues_say
 from torch_ebip.learning.configuration import Task
 from torch_ebip.learning.held_out import HeldOut, Trial
 from torch_ebip.learning.recently import recent_sums
@@ -78,6 +78,10 @@ def test_they_bend_where_the_filter_cannot(bent: InteractionModel) -> None:
     assert bent.report["stages"]["analogues"]["error/end"] < 0.9 * bent.report["stages"]["shrinkage"]["error/end"]
     assert error(bent, tests) < 0.9 * error(straight, tests)
     assert straight.filter.analysis.recent is None
+    # What the present tells no expert tells better; then there is none.
+    assert not bent.report["expert"]["used"]
+    assert bent.filter.readout.expert is None
+    assert len(bent.filter.analysis.recent.windows) == 1
     assert "analogues" not in straight.report
 
 
@@ -117,7 +121,7 @@ def test_a_model_that_grows_compares_with_the_new_ones_too(bent: InteractionMode
 
 
 def test_a_seed_reproduces(bent: InteractionModel) -> None:
-    again = learn(bending(60), **QUICK)
+    again = learn(bending(60), expert=False, **QUICK)
     for ours, theirs in zip(bent.filter.parameters(), again.filter.parameters(), strict=True):
         assert torch.equal(ours, theirs)
 
@@ -146,7 +150,7 @@ def test_what_analogues_are_worth_is_asked_of_those_who_did_not_see_it() -> None
     same = [torch.equal(a.relevance.raw, b.relevance.raw) for a, b in zip(*found, strict=True)]
     assert same == [False, True, False, False]
     noting = [Noting.of(primitive) for _ in range(3)]
-    learn_stacking(held_out, found[0][-1], noting, said, torch.arange(24))
+    what_analogues_say(held_out, noting, said)
     for f, each in enumerate(noting):
         torch.testing.assert_close(torch.cat(each.asked), said.present.phase[fold == f])
 

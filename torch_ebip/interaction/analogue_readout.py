@@ -19,6 +19,7 @@ from torch_ebip.common.ambient import owned
 from torch_ebip.common.modules import sharing
 from torch_ebip.filtering.protocols import View
 from torch_ebip.interaction.analogues import Analogues
+from torch_ebip.interaction.expert import Expert
 from torch_ebip.interaction.forecast import Forecast
 from torch_ebip.interaction.horizons import SECONDS, horizon_hats, level_hats
 from torch_ebip.interaction.present import Present
@@ -28,12 +29,12 @@ VOICES = ("filter", "analogues", "mean")
 
 
 class AnalogueReadout(nn.Module):
-    """Mean h + sum_j B_j l_j (f - h) + C (h - m), deviation a sigma_f + b sigma_h + c sigma_m, by horizon.
+    """Mean g = h + sum_j B_j l_j (f - h) + C (h - m), deviation a sigma_f + b sigma_h + c sigma_m, by horizon.
 
-    l_j are the weights of J levels of sigma_f / sigma_m, DoF by DoF, that sum to 1, see `level_hats`. h is the
-    forecast of analogues, a weighted mean of demonstrations, f the filter's, m the mean of all demonstrations; sigma
-    are their deviations. The filter's members keep their order and their weights: they are moved with the mean and
-    stretched with the deviation.
+    With an expert, which says e, the mean is g + sum_j v_j l_j (e - g). l_j are the weights of J levels of
+    sigma_f / sigma_m, DoF by DoF, that sum to 1, see `level_hats`. h is the forecast of analogues, a weighted mean of
+    demonstrations, f the filter's, m the mean of all demonstrations; sigma are their deviations. The filter's members
+    keep their order and their weights: they are moved with the mean and stretched with the deviation.
 
     Args:
         analogues: over the same layout.
@@ -44,10 +45,12 @@ class AnalogueReadout(nn.Module):
         seconds: [K] increasing; between them all are linear, before the first and behind the last as there.
             Infinity, the last, is the end.
         levels: [J] increasing, of sigma_f / sigma_m; as the seconds. Default: one, B alike for all.
+        expert: see `Expert`; default: none.
+        heed: [K, D, J], v, between 0 and 1, if there is an expert; 0 for DoFs of which it says nothing.
 
     Raises:
-        ValueError: shapes that do not fit, numbers that are not finite, negative widths, seconds or levels that do
-            not increase.
+        ValueError: shapes that do not fit, numbers that are not finite, negative widths, shares outside [0, 1],
+            seconds or levels that do not increase; an expert without a share, or a share without an expert.
 
     Example:
         >>> import torch
@@ -77,6 +80,7 @@ class AnalogueReadout(nn.Module):
     width: Tensor
     seconds: Tensor
     levels: Tensor
+    heed: Tensor | None
 
     def __init__(
         self,
@@ -86,6 +90,8 @@ class AnalogueReadout(nn.Module):
         width: Tensor,
         seconds: Sequence[float] = SECONDS,
         levels: Sequence[float] = (1.0,),
+        expert: Expert | None = None,
+        heed: Tensor | None = None,
     ) -> None:
         super().__init__()
         places, widths = increasing("seconds", seconds, follow), increasing("levels", levels, follow)
@@ -99,7 +105,12 @@ class AnalogueReadout(nn.Module):
                 raise ValueError(f"{name} must be {list(shape)} and finite, got {list(values.shape)}")
         if not bool((width >= 0).all() & (width.sum(-1) > 0).all()):
             raise ValueError(f"width must not be negative, and above 0 together, got {float(width.min()):g}")
-        self.analogues = analogues
+        if (expert is None) != (heed is None):
+            raise ValueError("an expert and its shares, heed, come together")
+        if heed is not None and (heed.shape != (K, D, J) or not bool(((heed >= 0) & (heed <= 1)).all())):
+            raise ValueError(f"heed must be {[K, D, J]} between 0 and 1, got {list(heed.shape)}")
+        self.analogues, self.expert = analogues, expert
+        self.register_buffer("heed", None if heed is None else owned(heed))
         self.register_buffer("follow", owned(follow))
         self.register_buffer("correct", owned(correct))
         self.register_buffer("width", owned(width))
@@ -126,12 +137,17 @@ class AnalogueReadout(nn.Module):
         theirs, spread = self.analogues.forecast(self.analogues(present), lead)
         at = horizon_hats(lead, self.seconds)  # [..., P, K]
         widths, apart = widths_of(forecast, variance), forecast.mean - theirs
-        if len(self.levels) > 1:
-            apart = (apart.unsqueeze(-2) * level_hats(widths, self.levels).transpose(-1, -2)).flatten(-2)
+        level = level_hats(widths, self.levels) if len(self.levels) > 1 else None  # [..., P, D, J]
+        if level is not None:
+            apart = (apart.unsqueeze(-2) * level.transpose(-1, -2)).flatten(-2)
         both = torch.cat([apart, theirs - mean], -1)
         D = self.width.shape[1]
         every = (both @ torch.cat([self.follow, self.correct], -1).flatten(0, 1).T).view(*at.shape, D)
         stacked = theirs + (at.unsqueeze(-2) @ every).squeeze(-2)
+        if self.expert is not None and self.heed is not None:
+            share = (at @ self.heed.flatten(1)).view(*at.shape[:-1], D, -1)
+            share = (share if level is None else share * level).sum(-1)
+            stacked = torch.lerp(stacked, self.expert(present, lead), share)
         of_each = torch.stack([widths.own, root(spread), widths.demonstrated], -1)
         deviation = ((at @ self.width.flatten(1)).view_as(of_each) * of_each).sum(-1)
         return moved(forecast, stacked, deviation, torch.ones_like(deviation), widths)
@@ -164,13 +180,17 @@ class AnalogueReadout(nn.Module):
         part.register_buffer("follow", self._by_level[:, dofs][..., dofs].flatten(-2))
         part.register_buffer("correct", self.correct[:, dofs][:, :, dofs])
         part.register_buffer("width", self.width[:, dofs])
+        if self.expert is not None and self.heed is not None:
+            part.expert = self.expert.select(view)
+            part.register_buffer("heed", self.heed[:, dofs])
         return part
 
     def extra_repr(self) -> str:
         """Sizes, and the mean of B's diagonal."""
         K, D, _ = self.width.shape
         followed = float(self._by_level.diagonal(0, 1, 3).mean())
-        return f"{D} DoFs, {K} horizons, {len(self.levels)} levels, follows the filter by {followed:.2g}"
+        heeded = "" if self.heed is None else f", an expert by {float(self.heed.mean()):.2g}"
+        return f"{D} DoFs, {K} horizons, {len(self.levels)} levels, follows the filter by {followed:.2g}{heeded}"
 
     @property
     def _by_level(self) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -22,27 +23,29 @@ class Present(NamedTuple):
         prior: [..., N], logarithm of what the members count that started as each demonstration, by what was seen so
             far; minus infinity for demonstrations that are none of the ensemble.
         line: over all D DoFs of the layout, see `Line`.
+        before: of every window that is remembered, [..., W, D], where there is more than one.
     """
 
     phase: Tensor
     variance: Tensor
     prior: Tensor
     line: Line
+    before: Line | None = None
 
     def __repr__(self) -> str:
         return brief(self)
 
 
-def recent_of(primitive: InteractionPrimitive, window: float = WINDOW) -> Recent:
+def recent_of(primitive: InteractionPrimitive, window: float = WINDOW, slower: Sequence[float] = ()) -> Recent:
     """What remembers what was seen of late, for filters of a primitive.
 
     Args:
         primitive: of the demonstrations.
-        window: s, see `Recent`.
+        window, slower: s, see `Recent`.
     """
     weights = primitive.weights
     middle = primitive.basis.project(weights.new_full((), 0.5), weights.mean(0))
-    return Recent(middle, window)
+    return Recent(middle, window, slower)
 
 
 def present_of(phase: Tensor, memory: Memory, recent: Recent, count: int) -> Present:
@@ -64,7 +67,9 @@ def present_of(phase: Tensor, memory: Memory, recent: Recent, count: int) -> Pre
     square = (weights * (phase - mean.unsqueeze(-1)).square()).sum(-1)
     several = 1 - weights.square().sum(-1)
     variance = square / several.clamp(min=torch.finfo(several.dtype).eps)  # as that of an ensemble
-    return Present(mean, variance, prior_of(memory, count), recent.line(memory.recent))
+    before = recent.lines(memory.recent) if len(recent.windows) > 1 else None
+    line = recent.line(memory.recent) if before is None else Line(*(part[..., 0, :] for part in before))
+    return Present(mean, variance, prior_of(memory, count), line, before)
 
 
 def prior_of(memory: Memory, count: int) -> Tensor:

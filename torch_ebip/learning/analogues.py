@@ -1,4 +1,4 @@
-"""What near means to analogues, and how much they count beside the filter: from interactions left out.
+"""What near means to analogues: from interactions left out.
 
 The parameters of the kernel are few, and tuned by gradient on what the analogues alone say of interactions that are
 none of them. They are the same for all sets of sensors that are shown, so that they serve others, too. What analogues
@@ -10,7 +10,6 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -18,16 +17,12 @@ from torch import Tensor, nn
 from torch_ebip.common.ambient import without_autocast
 from torch_ebip.filtering.protocols import View
 from torch_ebip.filtering.states import map_state
-from torch_ebip.interaction.analogue_readout import VOICES, AnalogueReadout
 from torch_ebip.interaction.analogues import PORTION, Analogues
-from torch_ebip.interaction.horizons import LEVELS
 from torch_ebip.interaction.present import Present
 from torch_ebip.interaction.readout import Lead
-from torch_ebip.learning.drawing import Drawn, asked_of, drawn_of
 from torch_ebip.learning.held_out import HeldOut
 from torch_ebip.learning.partition import generator_of
 from torch_ebip.learning.said import Said
-from torch_ebip.learning.stacking import best_correction, best_width
 
 FEWEST = 20
 """Demonstrations below which nothing can be said of what near means."""
@@ -63,7 +58,7 @@ def fit_analogues(analogues: Analogues, held_out: HeldOut, said: Said) -> list[A
     Returns:
         For each fold the same, tuned without it.
     """
-    fold = _fold_of(held_out, said)
+    fold = fold_of(held_out, said)
     without = [copy.deepcopy(analogues) for _ in range(held_out.settings.folds)]
     for f, each in enumerate(without):
         _tune(each, held_out, said, fold != f)
@@ -109,66 +104,15 @@ def _tune(analogues: Analogues, held_out: HeldOut, said: Said, some: Tensor) -> 
 
 @without_autocast
 @torch.no_grad()
-def learn_stacking(
-    held_out: HeldOut,
-    analogues: Analogues,
-    without: Sequence[Analogues],
-    said: Said,
-    scored: Tensor,
-    corrected: bool = True,
-) -> Drawn:
-    """How analogues are corrected by the filter and the mean, and how wide all together are.
+def what_analogues_say(held_out: HeldOut, without: Sequence[Analogues], said: Said) -> tuple[Tensor, Tensor]:
+    """What analogues say less the mean, and their deviation, [R, K, P, D] of the targets, in units of the scale.
 
     Args:
         held_out: the demonstrations, and what is asked of them: seconds ahead.
-        analogues: as they will be used.
-        without: the same tuned without each fold, which say what they are worth there, see `fit_analogues`.
-        said: by the filter, without a read-out, of the interactions that decide.
-        scored: int64 [S], those among them whose scores are told.
-        corrected: otherwise analogues speak alone.
+        without: tuned without each fold, which they speak of, see `fit_analogues`.
+        said: by a filter that remembers what was seen of late; by what it knew of the present.
     """
-    layout, objective, targets, ahead, names = asked_of(held_out)
-    scale = objective.scale
-    fold = _fold_of(held_out, said)
-    theirs, spread = _say(held_out, without, said, fold)
-    modality = layout.modality_of_dof.to(theirs.device)
-    S, D, V, J = said.place.shape[-1], layout.n_dofs, len(VOICES), said.level.shape[-1]
-    follow = torch.eye(D, dtype=theirs.dtype, device=theirs.device).repeat(S, J, 1, 1)  # [S, J, D, D]
-    correct, width = theirs.new_zeros(S, D, D), theirs.new_zeros(S, D, V)
-    width[..., 0] = 1
-    drawn, deviation = torch.zeros_like(theirs), torch.zeros_like(theirs)
-    shares: dict[str, Any] = {}
-    for m in sorted(set(modality[targets].tolist())):
-        ours, here = modality[targets] == m, ((modality == m) & targets).nonzero().squeeze(-1)
-        wanted, n = said.wanted[..., ours], len(here)
-        apart = (said.towards - theirs)[..., ours].unsqueeze(-2) * said.level[..., ours, :].transpose(-1, -2)
-        voices = int(corrected) * torch.cat([apart.flatten(-2), theirs[..., ours]], -1)
-        found = best_correction(voices, said.place, wanted - theirs[..., ours], fold, held_out.settings.folds)
-        # B and C are in units of the scale, which each horizon has of its own.
-        units = scale[:, ours]
-        per = units.unsqueeze(-1) / units.unsqueeze(-2)
-        whole = found.whole.reshape(S, n, J + 1, n)  # [S, n, J + 1, n]
-        for j in range(J):
-            follow[:, j, here.unsqueeze(-1), here] = whole[..., j, :] * per
-        correct[:, here.unsqueeze(-1), here] = whole[..., J, :] * per
-        drawn[..., ours] = theirs[..., ours] + found.left_out
-        of_each = torch.stack([said.own, spread, said.demonstrated], -1)[..., ours, :]
-        width[:, here], deviation[..., ours] = best_width(
-            of_each, said.place, wanted - drawn[..., ours], fold, held_out.settings.folds
-        )
-        diagonals = whole.diagonal(0, 1, 3).mean(-1).tolist()  # [S, J + 1]
-        shares[layout.names[m]] = {
-            part: {name: round(values[i], 3) for name, values in zip(names, diagonals, strict=True)}
-            for i, part in ((0, "follow_sure"), (J - 1, "follow_unsure"), (J, "correct"))
-        }
-    side_by_side = follow.transpose(1, 2).flatten(-2)
-    readout = AnalogueReadout(analogues, side_by_side, correct, width, ahead.tolist(), LEVELS)
-    return drawn_of(held_out, said, scored, readout, shares, drawn, deviation)
-
-
-def _say(held_out: HeldOut, without: Sequence[Analogues], said: Said, fold: Tensor) -> tuple[Tensor, Tensor]:
-    """What analogues say less the mean, and their deviation, [R, K, P, D] of the targets, in units of the scale;
-    of each fold [R] those that were tuned without it."""
+    fold = fold_of(held_out, said)
     lead, scale = _lead(held_out), held_out.task.objective.scale
     portion = max(1, PORTION // (said.place[0, ..., 0].numel() * len(without[0].pace) * scale.shape[-1]))
     mean, variance = torch.empty_like(said.mean), torch.empty_like(said.mean)
@@ -180,8 +124,8 @@ def _say(held_out: HeldOut, without: Sequence[Analogues], said: Said, fold: Tens
     return mean / scale - said.mean, variance.clamp(min=0).sqrt() / scale
 
 
-def _fold_of(held_out: HeldOut, said: Said) -> Tensor:
-    """int64 [R], of what was said."""
+def fold_of(held_out: HeldOut, said: Said) -> Tensor:
+    """int64 [R], of what was ``said``."""
     return held_out.partition.fold_of.to(said.interaction.device)[said.interaction]
 
 

@@ -5,7 +5,6 @@ Nothing is looked up by a name that a file chooses: every family that can be bui
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -20,8 +19,6 @@ from torch_ebip.filtering.updates.inflation import Inflation
 from torch_ebip.filtering.updates.rules import SquareRoot
 from torch_ebip.filtering.updates.student_t import StudentT
 from torch_ebip.filtering.updates.trust import RobustWeights
-from torch_ebip.interaction.analogue_readout import VOICES, AnalogueReadout
-from torch_ebip.interaction.analogues import Analogues
 from torch_ebip.interaction.basis.base import Basis
 from torch_ebip.interaction.basis.bspline import BSplineBasis
 from torch_ebip.interaction.basis.gaussian import GaussianBasis
@@ -32,7 +29,6 @@ from torch_ebip.interaction.evidence import EvidenceWeighting
 from torch_ebip.interaction.filter_kinds import InteractionEnsembleFilter
 from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.gated_noise import PhaseGatedNoise
-from torch_ebip.interaction.horizons import HorizonShrinkage
 from torch_ebip.interaction.noise import InteractionNoise
 from torch_ebip.interaction.phases.constant_velocity import ConstantVelocityPhase
 from torch_ebip.interaction.phases.drifting import DriftingPhase
@@ -40,10 +36,9 @@ from torch_ebip.interaction.phases.phase import PhaseModel
 from torch_ebip.interaction.present import recent_of
 from torch_ebip.interaction.presets import ebip
 from torch_ebip.interaction.primitive import InteractionPrimitive
-from torch_ebip.interaction.readout import Readout
 from torch_ebip.interaction.recognition import PHASES, Recognition
-from torch_ebip.interaction.shrinkage import Shrinkage
 from torch_ebip.learning.caution import describe_caution, give_caution
+from torch_ebip.learning.readout_descriptions import describe_readout, readout_of
 from torch_ebip.recordings.layout import Layout, Modality
 
 BASES: dict[str, type[Basis]] = {
@@ -141,8 +136,8 @@ def describe_filter(filter: InteractionFilter, primitive: InteractionPrimitive) 
         "robust": type(update.trust[0]).__name__ if len(update.trust) else None,
         "inflation": "learned" if learned else float(inflation.factor) if isinstance(inflation, Inflation) else None,  # type: ignore[arg-type]
         "phase": _describe_phase(filter.phase_model),
-        "readout": _describe_readout(filter.readout),
-        "recent": None if update.recent is None else update.recent.window,
+        "readout": describe_readout(filter.readout),
+        "recent": None if update.recent is None else list(update.recent.windows),
         "recognition": filter.recognition is not None and len(filter.recognition.sharpness) > 0,
         **describe_caution(filter),
     }
@@ -185,9 +180,11 @@ def build_filter(primitive: InteractionPrimitive, description: Description) -> I
         ):
             ones = primitive.weights.new_ones(len(weighting.forgetting.start), len(PHASES))
             filter.recognition = Recognition(primitive.labels, ones).to(primitive.weights)
-        filter.readout = None if readout is None else _readout_of(readout, primitive)
+        filter.readout = None if readout is None else readout_of(readout, primitive)
         if description.get("recent") is not None:  # older files know of none
-            filter.analysis.recent = recent_of(primitive, float(description["recent"]))
+            windows = description["recent"]
+            windows = windows if isinstance(windows, list) else [windows]  # before version 6: one
+            filter.analysis.recent = recent_of(primitive, float(windows[0]), [float(w) for w in windows[1:]])
         give_caution(filter, primitive, description)
         return filter
     except (AttributeError, ArithmeticError, LookupError, TypeError, ValueError) as error:
@@ -243,38 +240,6 @@ def _describe_phase(phase: PhaseModel) -> Description:
     if family not in (ConstantVelocityPhase, DriftingPhase):
         raise TypeError(f"a model file keeps the phases of the library, not {family.__name__}")
     return {"family": family.__name__, "overrun": phase.overrun}
-
-
-def _describe_readout(readout: Readout | None) -> Any:
-    if readout is None:
-        return None
-    if isinstance(readout, HorizonShrinkage | AnalogueReadout):
-        seconds = [s if math.isfinite(s) else "end" for s in readout.seconds.tolist()]
-        if isinstance(readout, AnalogueReadout):
-            compared = readout.analogues.dofs.tolist()
-            analogues = {"compared": compared, "unlike": readout.analogues.unlike}
-            return {"seconds": seconds, "levels": readout.levels.tolist(), **analogues}
-        return {"seconds": seconds, "levels": readout.levels.tolist()}
-    if isinstance(readout, Shrinkage):
-        return readout.leads.tolist()
-    raise TypeError(f"a model file keeps the read-outs of the library, not {type(readout).__name__}")
-
-
-def _readout_of(description: Any, primitive: InteractionPrimitive) -> Readout:
-    ones = primitive.weights.new_ones
-    D = primitive.layout.n_dofs
-    if isinstance(description, list):  # of older files
-        return Shrinkage(ones(D, len(description)), description)
-    seconds = [math.inf if s == "end" else float(s) for s in description["seconds"]]
-    if "compared" in description:
-        compared = torch.zeros(D, dtype=torch.bool, device="cpu")
-        compared[description["compared"]] = True
-        analogues = Analogues.of(primitive, compared, description.get("unlike", 0.0))  # before version 6: never
-        K, levels = len(seconds), description.get("levels", [1.0])  # before version 5: one
-        follow, correct = ones(K, D, len(levels) * D), ones(K, D, D)
-        return AnalogueReadout(analogues, follow, correct, ones(K, D, len(VOICES)), seconds, levels)
-    levels = description["levels"]
-    return HorizonShrinkage(ones(D, len(seconds), len(levels)), ones(D, len(seconds)), seconds, levels)
 
 
 def _phase_of(description: Description) -> PhaseModel:

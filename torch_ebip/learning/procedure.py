@@ -42,7 +42,7 @@ from torch_ebip.learning.starts import FACTORS, TRIES, Start, best_factor, best_
 from torch_ebip.learning.tuner import Tuner
 from torch_ebip.recordings.demonstrations import Demonstrations
 
-PROCEDURE = 4  # what another edition of this file began in a folder is not gone on with
+PROCEDURE = 5  # what another edition of this file began in a folder is not gone on with
 FEWEST = 10
 """Demonstrations below which there is no gradient: those kept for validation would say nothing."""
 DECIDING, MOST = 200, 100
@@ -64,6 +64,7 @@ class Procedure:
     steps: int
     shrink: bool
     analogues: bool
+    expert: bool
     ahead: tuple[float, ...]
     memories: int
     chances: dict[str, float]
@@ -133,6 +134,7 @@ class Procedure:
             "joints": objective.joints,
             "shrink": self.shrink,
             "analogues": self.analogues,
+            "expert": self.expert,
             "ahead": [horizon_name(a) for a in self.ahead],
             "memories": self.memories,
             "chances": self.chances,
@@ -236,7 +238,7 @@ class Procedure:
         """See `learn_readout`."""
         self.reporter.stage("read-out")
         make = Analogues.of if self.shrink and self.analogues else None
-        found = learn_readout(self.held_out, filter, self.deciding, self.scored, make)
+        found = learn_readout(self.held_out, filter, self.deciding, self.scored, make, expert=self.expert)
         if self.shrink:
             self.said |= found.said
             self.scores |= found.scores

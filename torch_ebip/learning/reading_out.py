@@ -1,4 +1,7 @@
-"""Which read-out a filter gets: drawn towards the mean alone, or stacked with analogues; validation decides."""
+"""Which read-out a filter gets: drawn towards the mean alone, or stacked with analogues, perhaps with an expert.
+
+Validation decides each.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +14,17 @@ from torch import Tensor
 from torch_ebip.common.ambient import without_autocast
 from torch_ebip.common.brief import brief
 from torch_ebip.interaction.analogues import Analogues
+from torch_ebip.interaction.expert import SLOWER, Expert
 from torch_ebip.interaction.filter_kinds import InteractionEnsembleFilter
 from torch_ebip.interaction.present import recent_of
 from torch_ebip.interaction.primitive import InteractionPrimitive
-from torch_ebip.learning.analogues import FEWEST, fit_analogues, learn_stacking, moments_of
+from torch_ebip.learning.analogues import FEWEST, fit_analogues, moments_of
 from torch_ebip.learning.drawing import Drawn, learn_drawing
+from torch_ebip.learning.expert import FEWEST as ENOUGH
+from torch_ebip.learning.expert import fit_experts
 from torch_ebip.learning.held_out import HeldOut
 from torch_ebip.learning.said import what_it_says
+from torch_ebip.learning.stacked import learn_correction, learn_heed, put_together
 from torch_ebip.learning.stages import Scores
 
 Makes: TypeAlias = "Callable[[InteractionPrimitive, Tensor], Analogues]"
@@ -29,7 +36,7 @@ class ReadOut(NamedTuple):
 
     Attributes:
         drawn: the read-out that the filter now has, and what it comes to.
-        scores: of each that was tried, by stage: ``shrinkage`` and ``analogues``.
+        scores: of each that was tried, by stage: ``shrinkage``, ``analogues`` and ``expert``.
         said: what the report says of them.
         remarks: what was not tried, and why.
     """
@@ -52,6 +59,7 @@ def learn_readout(
     analogues: Makes | None,
     choose: bool = True,
     corrected: bool = True,
+    expert: bool = True,
 ) -> ReadOut:
     """Give a filter the read-out with the smaller CRPS on interactions left out.
 
@@ -63,14 +71,19 @@ def learn_readout(
         analogues: what makes them, such as `Analogues.of`; None: they are not tried.
         choose: whether they must be better; otherwise they are used wherever they can be.
         corrected: whether they are corrected by the filter and the mean, see `AnalogueReadout`.
+        expert: whether one may be heard beside analogues, where it pays.
     """
     remarks = []
     task = held_out.task
     if analogues is not None and len(task.primitive) < FEWEST:
         remarks.append(f"no analogues: {len(task.primitive)} demonstrations, {FEWEST} tell what near means")
         analogues = None
+    expert = expert and analogues is not None
+    if expert and len(task.primitive) < ENOUGH:
+        remarks.append(f"no expert: {len(task.primitive)} demonstrations, a network needs {ENOUGH}")
+        expert = False
     if analogues is not None:
-        filter.analysis.recent = recent_of(task.primitive)
+        filter.analysis.recent = recent_of(task.primitive, slower=SLOWER if expert else ())
     with torch.no_grad():
         said = what_it_says(held_out, filter, interactions, None if analogues is None else moments_of(held_out))
     drawn = learn_drawing(held_out, said, scored)
@@ -79,14 +92,35 @@ def learn_readout(
         shown = torch.stack(list(task.subsets.values())).any(0)
         head = analogues(task.primitive, shown)
         without = fit_analogues(head, held_out, said)
-        stacked = learn_stacking(held_out, head, without, said, scored, corrected)
+        corrections = learn_correction(held_out, without, said, corrected)
+        stacked = put_together(held_out, head, corrections, said, scored)
         scores["analogues"] = stacked.scores
+        if expert:
+            assert task.objective.ahead is not None
+            network = Expert.of(task.primitive, shown, task.targets, task.objective.ahead.tolist())
+            experts = fit_experts(network, held_out, recent_of(task.primitive, slower=SLOWER), interactions)
+            heeded = learn_heed(held_out, experts, said, corrections.drawn)
+            pays = bool((heeded.heed > 0).any())
+            with_it = put_together(held_out, head, corrections, said, scored, network, heeded) if pays else stacked
+            scores["expert"] = with_it.scores
+            heard = with_it.scores["crps"] < stacked.scores["crps"]
+            told["expert"] = _told(heard, with_it, stacked, heeded.shares)
+            if heard:
+                stacked = with_it
+            else:
+                filter.analysis.recent = recent_of(task.primitive)
         used = not choose or stacked.scores["crps"] < drawn.scores["crps"]
-        told["analogues"] = {"used": used, "shares": stacked.shares, "crps": round(stacked.scores["crps"], 5),
-                             "crps_without": round(drawn.scores["crps"], 5)}  # fmt: skip
+        told["analogues"] = _told(used, stacked, drawn, corrections.shares)
         if used:
             drawn = stacked
         else:
             filter.analysis.recent = None
+            told.pop("expert", None)
     filter.readout = drawn.readout
     return ReadOut(drawn, scores, told, remarks)
+
+
+def _told(used: bool, tried: Drawn, otherwise: Drawn, shares: dict[str, Any]) -> dict[str, Any]:
+    """For the report."""
+    crps, without = (round(each.scores["crps"], 5) for each in (tried, otherwise))
+    return {"used": used, "shares": shares, "crps": crps, "crps_without": without}

@@ -46,6 +46,7 @@ def learn(
     basis: StackedBasis | None = None,
     shrink: bool = True,
     analogues: bool = True,
+    expert: bool = True,
     ahead: Sequence[float] = AHEAD,
     memories: int = 2,
     scan: int = 48,
@@ -81,6 +82,7 @@ def learn(
         shrink: whether forecasts are drawn towards the training mean, see `HorizonShrinkage`.
         analogues: whether they may be put together with those of analogues, where that is better; see
             `AnalogueReadout`.
+        expert: whether a recurrent network may be heard beside analogues, where that is better; see `Expert`.
         ahead: horizons that count alike, in s, increasing; the last is infinity, the end.
         memories: of the evidence: 2, a fast and a slow one, or the fast one alone.
         scan: how many interactions decide where the gradient starts.
@@ -145,6 +147,7 @@ def learn(
         steps,
         shrink,
         analogues,
+        expert,
         ahead,
         memories,
         chances,

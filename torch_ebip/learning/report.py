@@ -13,7 +13,7 @@ import torch
 from torch_ebip.interaction.basis.stacked import StackedBasis
 from torch_ebip.recordings.layout import Layout
 
-STAGES = ("mean", "nearest", "closed_form", "factor", "start", "gradient", "shrinkage", "analogues")
+STAGES = ("mean", "nearest", "closed_form", "factor", "start", "gradient", "shrinkage", "analogues", "expert")
 """In the order in which they are reported; the first two are what can be said without a filter."""
 
 CLEAR = 2.5
@@ -32,7 +32,7 @@ class Report(Mapping[str, Any]):
     read-out, and of read-outs: see `STAGES`), ``chosen`` (the stage whose filter the model has), ``interactions``
     (how many were left out to score them), ``demonstrations``, ``factor``, ``start``, ``validation`` (loss by step,
     after the read-out), ``best_step``, ``stopped_early``, ``shrinkage`` (mean shares by target and horizon),
-    ``analogues`` (whether they are used, how they are corrected, the CRPS with and without them), ``horizons``,
+    ``analogues`` and ``expert`` (whether they are used, their shares, the CRPS with and without them), ``horizons``,
     ``remarks`` (what was left out, and why), ``surprise`` (what of interactions left out is unusual, and what is then
     said; empty where they were too few), ``basis``, ``settings``, ``versions``, ``seconds``.
 
@@ -106,7 +106,7 @@ def verdict_of(
             looked.
         reason: why there was no gradient, or less of it than was asked for; None if there was.
     """
-    tried = [stages[name] for name in ("shrinkage", "analogues") if name in stages]
+    tried = [stages[name] for name in ("shrinkage", "analogues", "expert") if name in stages]
     last = min(tried, key=lambda scores: scores.get("crps", 0.0)) if tried else stages[chosen]
     mean, nearest = stages["mean"], stages["nearest"]
     if gain is None:

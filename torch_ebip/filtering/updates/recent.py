@@ -9,6 +9,7 @@ gaps and clocks that differ need no care, and a sensor that fell silent fades.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -25,6 +26,8 @@ from torch_ebip.filtering.updates.weighting import Seen
 
 WINDOW = 0.03
 """s, over which the last samples of a DoF make a line."""
+SUMS = 5
+"""Of each window."""
 FAINT = 1e-9
 """Belief below which nothing is believed: what is left of a sensor that fell silent, until its numbers underflow."""
 LEAST = 1e-30
@@ -36,7 +39,7 @@ SHORTEST = 0.1
 
 
 class Line(NamedTuple):
-    """Where DoFs are now and how they move, by what was seen of late.
+    """Where DoFs are now and how they move, by what was seen of late; of several windows, [..., W, D] each.
 
     Attributes:
         value: [..., D], at present, units of the DoFs; 0 where there are no samples.
@@ -44,12 +47,14 @@ class Line(NamedTuple):
         belief: [..., D], in [0, 1], how far the value may be believed: less, the older the samples are, and nothing
             where there are none.
         moves: bool [..., D], where there is a slope.
+        age: [..., D], s, mean age of the samples, as they count; 0 where there are none.
     """
 
     value: Tensor
     velocity: Tensor
     belief: Tensor
     moves: Tensor
+    age: Tensor
 
     def __repr__(self) -> str:
         return brief(self)
@@ -58,11 +63,13 @@ class Line(NamedTuple):
 class Recent(Part):
     """Remembers discounted sums of 1, t, t^2, y and t y over the samples of each DoF, t in seconds before now.
 
-    What it remembers is of all DoFs of the model, whatever view of it is at work.
+    What it remembers is of all DoFs of the model, whatever view of it is at work. With several windows it is a
+    recurrent memory of what was before, too: sums of each window, one below the other.
 
     Args:
         centre: [D], near which values lie, units of the DoFs: it is taken off before they are summed.
         window: s, after which a sample counts 1/e.
+        slower: s, further windows, W - 1 of them.
 
     Raises:
         ValueError: a window that is not positive.
@@ -83,13 +90,20 @@ class Recent(Part):
 
     centre: Tensor
     columns: Tensor
+    spans: Tensor
 
-    def __init__(self, centre: Tensor, window: float = WINDOW) -> None:
+    def __init__(self, centre: Tensor, window: float = WINDOW, slower: Sequence[float] = ()) -> None:
         super().__init__()
-        self.window = as_number("window", window, 0, above=True)
+        self._windows = tuple(as_number("window", each, 0, above=True) for each in (window, *slower))
         self.register_buffer("centre", owned(centre))
+        self.register_buffer("spans", centre.new_tensor(self._windows).unsqueeze(-1), persistent=False)  # [W, 1]
         self.register_buffer("columns", torch.arange(len(centre), device=centre.device), persistent=False)
-        self._kept: tuple[Tensor, int, float, Tensor] | None = None
+        self._kept: tuple[Tensor, int, Tensor] | None = None
+
+    @property
+    def windows(self) -> tuple[float, ...]:
+        """W windows, s, the one of the present first."""
+        return self._windows
 
     def check(self, model: StateSpace) -> None:
         """See `Part.check`: it is for as many DoFs as the model has."""
@@ -104,25 +118,25 @@ class Recent(Part):
         return part
 
     def start(self, like: Tensor) -> Tensor:
-        """[..., 5, D], nothing seen, batch dimensions of members ``like`` [..., E, n]."""
-        return self.centre.new_zeros(*like.shape[:-2], 5, len(self.centre))
+        """[..., 5 W, D], nothing seen, batch dimensions of members ``like`` [..., E, n]."""
+        return self.centre.new_zeros(*like.shape[:-2], SUMS * len(self._windows), len(self.centre))
 
     def forget(self, sums: Tensor, dt: Tensor) -> Tensor:
         """What is left of sums after some seconds: all samples are that much older, and count less.
 
         Args:
-            sums: [..., 5, D], see `start`.
+            sums: [..., 5 W, D], see `start`.
             dt: [...], seconds.
         """
         if dt.requires_grad or dt.is_inference() or torch.is_inference_mode_enabled():
             return self._ageing(dt) @ sums
         kept = self._kept  # another thread may exchange it
-        if kept is None or kept[0] is not dt or kept[1:3] != (dt._version, self.window):
-            self._kept = kept = dt, dt._version, self.window, self._ageing(dt)
-        return kept[3] @ sums
+        if kept is None or kept[0] is not dt or kept[1] != dt._version:
+            self._kept = kept = dt, dt._version, self._ageing(dt)
+        return kept[2] @ sums
 
     def _ageing(self, dt: Tensor) -> Tensor:
-        """[..., 5, 5]: (t - dt)^k in powers of t, times what is left after dt [...] s."""
+        """[..., 5 W, 5 W]: (t - dt)^k in powers of t, times what is left after dt [...] s, window by window."""
         zero, one = torch.zeros_like(dt), torch.ones_like(dt)
         rows = (
             (one, zero, zero, zero, zero),
@@ -132,13 +146,16 @@ class Recent(Part):
             (zero, zero, zero, -dt, one),
         )
         ageing = torch.stack([torch.stack(row, -1) for row in rows], -2)
-        return ageing * torch.exp(-dt / self.window)[..., None, None]
+        left = torch.exp(-dt.unsqueeze(-1) / self.spans[:, 0])  # [..., W]
+        each = ageing.unsqueeze(-3) * left[..., None, None]  # [..., W, 5, 5]
+        apart = torch.eye(len(self._windows), dtype=dt.dtype, device=dt.device)
+        return torch.einsum("...wij,wv->...wivj", each, apart).flatten(-4, -3).flatten(-2)
 
     def learn(self, sums: Tensor, seen: Seen) -> Tensor:
-        """Sums [..., 5, D] after a sample.
+        """Sums [..., 5 W, D] after a sample.
 
         Args:
-            sums: before it, [..., 5, D].
+            sums: before it, [..., 5 W, D].
             seen: the sample; of each value as much as it was believed.
         """
         columns = self.columns if seen.rows is None else self.columns[seen.rows]
@@ -149,26 +166,34 @@ class Recent(Part):
         if counts is None:
             counts = torch.ones_like(y)
         value, none = counts * (y - self.centre[columns]), torch.zeros_like(y)
-        added = torch.stack([counts, none, none, value, none], -2)
+        added = torch.stack([counts, none, none, value, none] * len(self._windows), -2)
         if added.ndim < sums.ndim:
             added = added.expand(*sums.shape[:-2], *added.shape[-2:])
         return sums.expand(*added.shape[:-2], *sums.shape[-2:]).index_add(-1, columns, added)
 
     def line(self, sums: Tensor) -> Line:
-        """The lines of sums [..., 5, D], units of the DoFs and a second; differentiable."""
-        samples, times, squares, values, products = sums.unbind(-2)
+        """Of the present: the lines of sums [..., 5 W, D], units of the DoFs and a second; differentiable."""
+        return self._lines(sums[..., :SUMS, :].unbind(-2), self.spans[0])
+
+    def lines(self, sums: Tensor) -> Line:
+        """Of all windows, parts [..., W, D]: see `line`."""
+        apart = sums.reshape(*sums.shape[:-2], len(self._windows), SUMS, sums.shape[-1])
+        return self._lines(apart.unbind(-2), self.spans)
+
+    def _lines(self, sums: Sequence[Tensor], span: Tensor) -> Line:
+        samples, times, squares, values, products = sums
         some = samples > LEAST
         samples = torch.where(some, samples, 1)
         time, value = times / samples, values / samples
         variance = squares / samples - time.square()
-        moves = some & (variance > (SHORTEST * self.window) ** 2)
+        moves = some & (variance > (SHORTEST * span).square())
         velocity = torch.where(moves, products / samples - time * value, 0) / torch.where(moves, variance, 1)
         present = torch.where(some, value - time * velocity + self.centre, 0)
         # As if the samples were from now: what the last ones count.
-        counted = (samples * torch.exp(-time / self.window)).clamp(max=1)
+        counted = (samples * torch.exp(-time / span)).clamp(max=1)
         belief = torch.where(some, counted * torch.exp(-0.5 * (time / HOLD).square()), 0)
         belief = torch.where(belief > FAINT, belief, 0)
-        return Line(present, velocity, belief, moves)
+        return Line(present, velocity, belief, moves, torch.where(some, -time, 0))
 
     def __getstate__(self) -> dict[str, Any]:
         """Copies and pickles have nothing kept."""
@@ -176,8 +201,8 @@ class Recent(Part):
 
     def meant(self) -> str:
         """What its tensors mean, see `Meaning`."""
-        return f"window={self.window:g}"
+        return "window=" + ", ".join(f"{window:g}" for window in self._windows)
 
     def extra_repr(self) -> str:
-        """The window."""
-        return f"window={self.window:g} s"
+        """The windows."""
+        return f"{self.meant()} s"

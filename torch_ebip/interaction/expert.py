@@ -1,0 +1,263 @@
+"""A recurrent expert: what was seen, of late and long before, read by a small network.
+
+A filter asks how far each demonstration explains what it sees, and analogues which of them is near; a network may
+find what neither has. What it remembers are lines through windows of different length (`Recent` with several
+windows), a linear recurrence: exact for any clock, and what was not measured changes nothing (Voelker, Kajic &
+Eliasmith 2019; Gu, Goel & Re 2022). The network reads them with two hidden layers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torch_ebip.common.ambient import owned
+from torch_ebip.common.brief import brief
+from torch_ebip.common.modules import sharing
+from torch_ebip.filtering.protocols import View
+from torch_ebip.filtering.updates.recent import WINDOW, Line
+from torch_ebip.interaction.horizons import SECONDS, horizon_hats
+from torch_ebip.interaction.present import Present
+from torch_ebip.interaction.primitive import InteractionPrimitive
+from torch_ebip.interaction.readout import Lead, increasing
+from torch_ebip.interaction.table import DemonstrationTable
+
+SLOWER = (0.1, 0.3, 1.0)
+"""s, windows that are remembered beside that of the present."""
+HIDDEN = 64
+"""Units of each hidden layer."""
+NETWORKS = 2
+"""That are trained alike from different starts; what they say is averaged."""
+FAR = 5.0
+"""Deviations beyond which all is equally far."""
+
+
+class Layers(NamedTuple):
+    """Weights of networks, with any leading dimensions: I inputs, H units, O outputs.
+
+    Attributes:
+        first: [..., I, H].
+        first_bias: [..., 1, H].
+        second: [..., H, H].
+        second_bias: [..., 1, H].
+        last: [..., H, O].
+        last_bias: [..., 1, O].
+        direct: [..., I, O], from inputs to outputs: what is linear need not go through the units.
+    """
+
+    first: Tensor
+    first_bias: Tensor
+    second: Tensor
+    second_bias: Tensor
+    last: Tensor
+    last_bias: Tensor
+    direct: Tensor
+
+    def __repr__(self) -> str:
+        return brief(self)
+
+    def read(self, inputs: Tensor, keep: Tensor | None = None) -> Tensor:
+        """Outputs [..., R, O] of inputs [..., R, I].
+
+        Args:
+            inputs: of R moments.
+            keep: [..., R, H], factors on the units of the second layer, in training; default: none.
+        """
+        units = nn.functional.silu(inputs @ self.first + self.first_bias)
+        units = nn.functional.silu(units @ self.second + self.second_bias)
+        units = units if keep is None else units * keep
+        return units @ self.last + self.last_bias + inputs @ self.direct
+
+
+class Expert(nn.Module):
+    """Says r(lead) + sum_k a_k(lead) (e_k - r_k): e_k is what the network says of the horizon k.
+
+    r is the path of the mean demonstration from the present phase on, at the mean pace, r_k where it will be at
+    horizon k, and a_k the weights of `horizon_hats`. So at horizon k it says e_k, and between horizons how far it is
+    off the mean is linear. The network's inputs are, of each DoF that is seen and each window, value and velocity of
+    a line in deviations, held within 5, its samples' mean age and 1; all of them times how far the present is
+    believed, so that what is not seen is 0.
+
+    Args:
+        path: of a single demonstration, the mean.
+        pace: 1/s, the mean phase velocity.
+        seen: int64 [k], DoFs that it reads.
+        said: int64 [T], DoFs that it speaks of; of others it says what the mean does.
+        seconds: [K] increasing, its horizons; infinity, the last, is the end.
+        windows: W, s, those that are remembered, that of the present first.
+        hidden: units of a layer.
+        networks: how many.
+
+    Raises:
+        ValueError: a path of several demonstrations, no DoF that it reads or speaks of, seconds that do not increase.
+
+    Example:
+        >>> import torch
+        >>> from torch_ebip import InteractionPrimitive
+        >>> from torch_ebip.interaction.expert import Expert
+        >>> from torch_ebip.recordings import example
+        >>> primitive = InteractionPrimitive.fit(example())
+        >>> controlled = primitive.layout.controlled
+        >>> Expert.of(primitive, ~controlled, controlled).extra_repr()
+        'reads 5 DoFs in 4 windows, says 6 at 5 horizons, 2 networks of 64 units'
+    """
+
+    seen: Tensor
+    said: Tensor
+    middle: Tensor
+    scale: Tensor
+    centre: Tensor
+    unit: Tensor
+    seconds: Tensor
+    pace: Tensor
+
+    def __init__(
+        self,
+        path: DemonstrationTable,
+        pace: Tensor,
+        seen: Tensor,
+        said: Tensor,
+        seconds: Sequence[float] = SECONDS,
+        windows: Sequence[float] = (WINDOW, *SLOWER),
+        hidden: int = HIDDEN,
+        networks: int = NETWORKS,
+    ) -> None:
+        super().__init__()
+        places = increasing("seconds", seconds, path.cells)
+        if len(path.cells) != 1 or not len(seen) or not len(said):
+            raise ValueError(
+                f"a path of one demonstration, DoFs that are read and DoFs that are said are needed, got "
+                f"{len(path.cells)}, {len(seen)} and {len(said)}"
+            )
+        new, k, K, T = path.cells.new_zeros, len(seen), len(places), len(said)
+        self.path, self.windows, self.hidden, self.networks = path, tuple(windows), hidden, networks
+        self.register_buffer("pace", owned(pace))
+        self.register_buffer("seen", owned(seen), persistent=False)
+        self.register_buffer("said", owned(said), persistent=False)
+        self.register_buffer("middle", new(k))
+        self.register_buffer("scale", new(2, k) + 1)
+        self.register_buffer("centre", new(K, T))
+        self.register_buffer("unit", new(K, T) + 1)
+        self.register_buffer("seconds", owned(places))
+        inputs = k * (2 * len(self.windows) + 2)
+        for name, rows, columns in (("first", inputs, hidden), ("second", hidden, hidden), ("last", hidden, K * T)):
+            self.register_buffer(name, new(networks, rows, columns))
+            self.register_buffer(f"{name}_bias", new(networks, 1, columns))
+        self.register_buffer("direct", new(networks, inputs, K * T))
+        # Of each DoF of the view, which of those that are said it is, and whether it is one.
+        D = path.n_dofs
+        place = torch.zeros(D, dtype=torch.long, device=said.device)
+        place[said] = torch.arange(T, device=said.device)
+        self.register_buffer("place", place, persistent=False)
+        self.register_buffer("spoken", torch.isin(torch.arange(D, device=said.device), said), persistent=False)
+
+    place: Tensor
+    spoken: Tensor
+
+    @classmethod
+    def of(
+        cls,
+        primitive: InteractionPrimitive,
+        seen: Tensor,
+        said: Tensor,
+        seconds: Sequence[float] = SECONDS,
+        windows: Sequence[float] = (WINDOW, *SLOWER),
+        hidden: int = HIDDEN,
+        networks: int = NETWORKS,
+    ) -> Expert:
+        """One that says nothing yet, beside a primitive's demonstrations.
+
+        Args:
+            primitive: of the demonstrations.
+            seen, said: bool [D], DoFs that it reads, and speaks of.
+            seconds, windows, hidden, networks: see `Expert`.
+        """
+        table = DemonstrationTable.of(primitive)
+        mean = DemonstrationTable(table.values.mean(0, keepdim=True), table.slopes.mean(0, keepdim=True))
+        reads, says = (mask.nonzero().squeeze(-1).to(primitive.weights.device) for mask in (seen, said))
+        return cls(mean, primitive.phase_velocity.mean(), reads, says, seconds, windows, hidden, networks)
+
+    @property
+    def layers(self) -> Layers:
+        """Of all networks, [M, ...]."""
+        return Layers(*(getattr(self, name) for name in Layers._fields))
+
+    def inputs(self, before: Line) -> Tensor:
+        """What the network reads, [..., k, 2 W + 2], of lines [..., W, D] through all windows."""
+        rows = self.seen
+        value, velocity, belief, age = (
+            part.index_select(-1, rows) for part in (before.value, before.velocity, before.belief, before.age)
+        )
+        values = ((value - self.middle) / self.scale[0]).clamp(-FAR, FAR)
+        velocities = (velocity / self.scale[1]).clamp(-FAR, FAR)
+        now = belief[..., 0, :].unsqueeze(-2)
+        old = age[..., -1, :].unsqueeze(-2) / self.windows[-1]
+        # Slower lines are 0 without samples, not where the DoF lies.
+        values = torch.where(belief > 0, values, 0)
+        return (torch.cat([values, velocities, old, torch.ones_like(old)], -2) * now).transpose(-1, -2)
+
+    def read(self, inputs: Tensor) -> Tensor:
+        """[..., K, T], what the networks say of the horizons, units of the DoFs, from `inputs` [..., k, 2 W + 2]."""
+        layers = self.layers
+        flat = inputs.reshape(-1, layers.first.shape[-2])
+        said = layers.read(flat).mean(0).view(*inputs.shape[:-2], *self.unit.shape)
+        return said * self.unit + self.centre
+
+    def forward(self, present: Present, lead: Lead) -> Tensor:
+        """Forecasts [..., P, D]; differentiable.
+
+        Args:
+            present: of a state whose update remembers the windows.
+            lead: of P horizons.
+
+        Raises:
+            ValueError: the update remembers other windows.
+        """
+        before = present.before
+        if before is None or before.value.shape[-2] != len(self.windows):
+            raise ValueError(f"the expert reads what was seen in windows of {self.windows} s: `Recent` of these")
+        said = self.read(self.inputs(before))
+        said = torch.where(self.spoken, said.index_select(-1, self.place), 0)
+        phase = present.phase.unsqueeze(-1)
+        horizons = self._mean(self._after(phase, self.seconds))
+        if lead.asked is None:
+            asked = lead.phase
+        else:
+            # As it was trained: so many seconds, also where the filter takes the end to be nearer.
+            asked = self._after(phase, lead.asked)
+            lead = lead._replace(seconds=lead.asked.to(asked).expand_as(lead.seconds))
+        at = horizon_hats(lead, self.seconds)
+        off = torch.where(self.spoken, said - horizons, 0)
+        return self._mean(asked) + at @ off
+
+    def _after(self, phase: Tensor, seconds: Tensor) -> Tensor:
+        """Phases [..., P] so many seconds [P] after a phase [..., 1], at the mean pace; 1 where the end is asked."""
+        end = seconds.isinf()
+        return torch.where(end, 1, phase + self.pace * torch.where(end, 0, seconds)).clamp(0, 1)
+
+    def _mean(self, phase: Tensor) -> Tensor:
+        """The mean path [..., P, D] at phases [..., P]."""
+        return self.path.at(torch.zeros(phase.shape[:-1], dtype=torch.long, device=phase.device), phase)
+
+    def select(self, view: View) -> Expert:
+        """The same for a view of the model: forecasts of its DoFs; what is read stays."""
+        part = sharing(self)
+        part.path = self.path.select(view)
+        dofs = view.dofs.to(self.place.device)
+        part.register_buffer("place", self.place[dofs], persistent=False)
+        part.register_buffer("spoken", self.spoken[dofs], persistent=False)
+        return part
+
+    def meant(self) -> str:
+        """What its tensors mean, see `Meaning`."""
+        return f"windows={self.windows}"
+
+    def extra_repr(self) -> str:
+        """Sizes."""
+        return (
+            f"reads {len(self.seen)} DoFs in {len(self.windows)} windows, says {len(self.said)} at "
+            f"{len(self.seconds)} horizons, {self.networks} networks of {self.hidden} units"
+        )
