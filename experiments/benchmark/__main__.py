@@ -115,10 +115,14 @@ def _print(results: Mapping[str, Any]) -> None:
         numbers = (row["with"], row["without"], row["with_over_without"])
         table.add_row(row["what"], *(f"{number:.3g}" for number in numbers))
     console.print(table)
-    heads = ["horizons", "bends", "straight", "an update", "bends / update"]
-    table = _table("a forecast with analogues: reaches, 3 sensors, live, 1 thread, us", heads)
+    heads = ["horizons", "with an expert", "bends", "straight", "an update", "of an expert's filter"]
+    table = _table(
+        "a forecast with analogues: reaches, 3 sensors, live, 1 thread, us",
+        [*heads, "bends / update", "with an expert / update"],
+    )
     for row in results["bending"]:
-        numbers = (row["bends"], row["straight"], row["update"], row["bends_over_update"])
+        keys = ("heard", "bends", "straight", "update", "update_heard", "bends_over_update", "heard_over_update")
+        numbers = tuple(row[key] for key in keys)
         table.add_row(str(row["horizons"]), *(f"{number:.3g}" for number in numbers))
     console.print(table)
     heads = ["sensors", "threads", "us a step and interaction", "one at a time / together"]

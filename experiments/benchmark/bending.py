@@ -1,4 +1,4 @@
-"""What a forecast with analogues costs, beside one without and an update, on the live path."""
+"""What a forecast with analogues, and with an expert too, costs, beside one without and an update, live."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import torch
 from experiments.surprise.reaches import reaches
 from experiments.timing import interleaved, threads
 from torch_ebip import AnalogueReadout, Analogues, InteractionPrimitive, LiveFilter, ebip
+from torch_ebip.interaction.expert import SLOWER, Expert
 from torch_ebip.interaction.horizons import LEVELS, SECONDS
 from torch_ebip.interaction.present import recent_of
 
@@ -25,7 +26,7 @@ def bending(rounds: int, seed: int, quick: bool) -> list[dict[str, Any]]:
     count = 40 if quick else 200
     primitive = InteractionPrimitive.fit(reaches(count, 10 * seed + 1))
     path, observed = reaches(1, 10 * seed + 2)[0].nan_to_num(), ~primitive.layout.controlled
-    lives = {name: _live(primitive, name == "bends", observed, path, seed) for name in ("bends", "straight")}
+    lives = {name: _live(primitive, name, observed, path, seed) for name in ("heard", "bends", "straight")}
     sample = path[len(path) // 2]
     rows = []
     for horizons in ((0.3,), SECONDS):
@@ -34,23 +35,30 @@ def bending(rounds: int, seed: int, quick: bool) -> list[dict[str, Any]]:
             for name, live in lives.items()
         }
         asked["update"] = lambda: lives["bends"].update(sample, observed)
+        asked["update_heard"] = lambda: lives["heard"].update(sample, observed)
         with threads(1):
             timings = interleaved(asked, rounds, warmup=20)
         microseconds = {key: 1e6 * timing.median for key, timing in timings.items()}
         row = {"horizons": len(horizons), **microseconds, "members": count}
-        rows.append(row | {"bends_over_update": microseconds["bends"] / microseconds["update"]})
+        ratios = {f"{name}_over_update": microseconds[name] / microseconds["update"] for name in ("bends", "heard")}
+        rows.append(row | ratios)
     return rows
 
 
-def _live(primitive: InteractionPrimitive, bends: bool, observed: torch.Tensor, path: torch.Tensor, seed: int) -> Any:
-    """A filter that has seen half of a path."""
+def _live(primitive: InteractionPrimitive, name: str, observed: torch.Tensor, path: torch.Tensor, seed: int) -> Any:
+    """A filter that has seen half of a path; its numbers do not matter."""
     filter = ebip(primitive, weigh=True, square_root=True)
-    if bends:
+    if name != "straight":
         D, K = primitive.layout.n_dofs, len(SECONDS)
         half = 0.5 * torch.eye(D).repeat(K, 1, 1)
         follow, width = half.repeat(1, 1, len(LEVELS)), torch.ones(K, D, 3) / 3
-        filter.analysis.recent = recent_of(primitive)
-        filter.readout = AnalogueReadout(Analogues.of(primitive), follow, 0.1 * half, width, levels=LEVELS)
+        filter.analysis.recent = recent_of(primitive, slower=SLOWER if name == "heard" else ())
+        expert = Expert.of(primitive, observed, ~observed) if name == "heard" else None
+        heed = None if expert is None else torch.full((K, D, len(LEVELS)), 0.3)
+        analogues = Analogues.of(primitive)
+        filter.readout = AnalogueReadout(
+            analogues, follow, 0.1 * half, width, levels=LEVELS, expert=expert, heed=heed
+        )
     live = LiveFilter(filter, observed, generator=torch.Generator().manual_seed(seed))
     for step, sample in enumerate(path[: len(path) // 2]):
         if step:

@@ -58,4 +58,4 @@ def test_growth_reports_every_size(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_forecast_that_bends_is_timed_beside_one_that_does_not() -> None:
     rows = bending.bending(3, 0, quick=True)
     assert [row["horizons"] for row in rows] == [1, 5]
-    assert all(row["bends"] > row["straight"] > 0 for row in rows)
+    assert all(row["heard"] > row["bends"] > row["straight"] > 0 for row in rows)

@@ -55,6 +55,8 @@ def test_all_of_them_answer(fold: Fold) -> None:
     # Nobody weighs members here, so that forgetting their weights changes nothing.
     assert model.filter.analysis.weighting is None
     assert said.pop("readout_again") == said["readout_no_memory"]
+    # And they are too few for an expert.
+    assert said.pop("readout_no_expert") == said["readout_no_memory"]
     assert len({round(v, 6) for v in said.values()}) == len(said)
     assert all(0 < v < 20 for v in said.values())
 

@@ -20,6 +20,7 @@ from torch_ebip.interaction.basis import (
 from torch_ebip.interaction.bounds import Bounds
 from torch_ebip.interaction.doubt import Doubt
 from torch_ebip.interaction.evidence import Evidence, EvidenceWeighting
+from torch_ebip.interaction.expert import Expert
 from torch_ebip.interaction.filter_kinds import (
     InteractionEnsembleFilter,
     InteractionExtendedFilter,
@@ -56,6 +57,7 @@ __all__ = [
     "Doubt",
     "Evidence",
     "EvidenceWeighting",
+    "Expert",
     "Forecast",
     "GaussianBasis",
     "HorizonShrinkage",

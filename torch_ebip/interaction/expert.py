@@ -36,16 +36,16 @@ FAR = 5.0
 
 
 class Layers(NamedTuple):
-    """Weights of networks, with any leading dimensions: I inputs, H units, O outputs.
+    """Weights of M networks: I inputs, H units, O outputs.
 
     Attributes:
-        first: [..., I, H].
-        first_bias: [..., 1, H].
-        second: [..., H, H].
-        second_bias: [..., 1, H].
-        last: [..., H, O].
-        last_bias: [..., 1, O].
-        direct: [..., I, O], from inputs to outputs: what is linear need not go through the units.
+        first: [M, I, H].
+        first_bias: [M, 1, H].
+        second: [M, H, H].
+        second_bias: [M, 1, H].
+        last: [M, H, O].
+        last_bias: [M, 1, O].
+        direct: [M, I, O], from inputs to outputs: what is linear need not go through the units.
     """
 
     first: Tensor
@@ -60,16 +60,16 @@ class Layers(NamedTuple):
         return brief(self)
 
     def read(self, inputs: Tensor, keep: Tensor | None = None) -> Tensor:
-        """Outputs [..., R, O] of inputs [..., R, I].
+        """Outputs [M, R, O] of inputs [M, R, I].
 
         Args:
             inputs: of R moments.
-            keep: [..., R, H], factors on the units of the second layer, in training; default: none.
+            keep: [M, R, H], factors on the units of the second layer, in training; default: none.
         """
-        units = nn.functional.silu(inputs @ self.first + self.first_bias)
-        units = nn.functional.silu(units @ self.second + self.second_bias)
+        units = nn.functional.silu(torch.baddbmm(self.first_bias, inputs, self.first))
+        units = nn.functional.silu(torch.baddbmm(self.second_bias, units, self.second))
         units = units if keep is None else units * keep
-        return units @ self.last + self.last_bias + inputs @ self.direct
+        return torch.baddbmm(torch.baddbmm(self.last_bias, units, self.last), inputs, self.direct)
 
 
 class Expert(nn.Module):
@@ -83,7 +83,7 @@ class Expert(nn.Module):
 
     Args:
         path: of a single demonstration, the mean.
-        pace: 1/s, the mean phase velocity.
+        pace: [], 1/s, the mean phase velocity.
         seen: int64 [k], DoFs that it reads.
         said: int64 [T], DoFs that it speaks of; of others it says what the mean does.
         seconds: [K] increasing, its horizons; infinity, the last, is the end.
@@ -187,24 +187,22 @@ class Expert(nn.Module):
 
     def inputs(self, before: Line) -> Tensor:
         """What the network reads, [..., k, 2 W + 2], of lines [..., W, D] through all windows."""
-        rows = self.seen
-        value, velocity, belief, age = (
-            part.index_select(-1, rows) for part in (before.value, before.velocity, before.belief, before.age)
+        parts = torch.stack([before.value, before.velocity, before.belief, before.age]).index_select(-1, self.seen)
+        value, velocity, belief, age = parts.unbind(0)
+        # Lines without samples are at 0, not where the DoF lies.
+        value = torch.where(belief > 0, value - self.middle, 0)
+        lines = (torch.cat([value, velocity], -2) / self.scale.repeat_interleave(len(self.windows), 0)).clamp(
+            -FAR, FAR
         )
-        values = ((value - self.middle) / self.scale[0]).clamp(-FAR, FAR)
-        velocities = (velocity / self.scale[1]).clamp(-FAR, FAR)
-        now = belief[..., 0, :].unsqueeze(-2)
-        old = age[..., -1, :].unsqueeze(-2) / self.windows[-1]
-        # Slower lines are 0 without samples, not where the DoF lies.
-        values = torch.where(belief > 0, values, 0)
-        return (torch.cat([values, velocities, old, torch.ones_like(old)], -2) * now).transpose(-1, -2)
+        old = age[..., -1:, :] / self.windows[-1]
+        return (torch.cat([lines, old, torch.ones_like(old)], -2) * belief[..., :1, :]).transpose(-1, -2)
 
     def read(self, inputs: Tensor) -> Tensor:
         """[..., K, T], what the networks say of the horizons, units of the DoFs, from `inputs` [..., k, 2 W + 2]."""
         layers = self.layers
-        flat = inputs.reshape(-1, layers.first.shape[-2])
+        flat = inputs.reshape(-1, layers.first.shape[-2]).expand(self.networks, -1, -1)
         said = layers.read(flat).mean(0).view(*inputs.shape[:-2], *self.unit.shape)
-        return said * self.unit + self.centre
+        return torch.addcmul(self.centre, said, self.unit)
 
     def forward(self, present: Present, lead: Lead) -> Tensor:
         """Forecasts [..., P, D]; differentiable.
@@ -219,19 +217,17 @@ class Expert(nn.Module):
         before = present.before
         if before is None or before.value.shape[-2] != len(self.windows):
             raise ValueError(f"the expert reads what was seen in windows of {self.windows} s: `Recent` of these")
-        said = self.read(self.inputs(before))
-        said = torch.where(self.spoken, said.index_select(-1, self.place), 0)
-        phase = present.phase.unsqueeze(-1)
-        horizons = self._mean(self._after(phase, self.seconds))
+        said = self.read(self.inputs(before)).index_select(-1, self.place)  # [..., K, D]
+        phase, K = present.phase.unsqueeze(-1), len(self.seconds)
         if lead.asked is None:
-            asked = lead.phase
+            of = torch.cat([self._after(phase, self.seconds), lead.phase], -1)
         else:
             # As it was trained: so many seconds, also where the filter takes the end to be nearer.
-            asked = self._after(phase, lead.asked)
-            lead = lead._replace(seconds=lead.asked.to(asked).expand_as(lead.seconds))
-        at = horizon_hats(lead, self.seconds)
-        off = torch.where(self.spoken, said - horizons, 0)
-        return self._mean(asked) + at @ off
+            of = self._after(phase, torch.cat([self.seconds, lead.asked.to(self.seconds)]))
+            lead = lead._replace(seconds=lead.asked.to(of), end=lead.asked.isinf().to(of))
+        mean = self._mean(of)
+        off = torch.where(self.spoken, said - mean[..., :K, :], 0)
+        return mean[..., K:, :] + horizon_hats(lead, self.seconds) @ off
 
     def _after(self, phase: Tensor, seconds: Tensor) -> Tensor:
         """Phases [..., P] so many seconds [P] after a phase [..., 1], at the mean pace; 1 where the end is asked."""

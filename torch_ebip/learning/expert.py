@@ -65,11 +65,11 @@ def fit_experts(expert: Expert, held_out: HeldOut, recent: Recent, interactions:
     every = [*experts, expert]
     for each, pool in zip(every, pools, strict=True):
         each.centre.copy_(truth[pool].flatten(0, 1).nanmean(0).nan_to_num())
-    centres = torch.stack([each.centre for each in every])[:, None, None]  # [G, 1, 1, K, T]
+    centres = torch.stack([each.centre for each in every])[:, None]  # [G, 1, K, T]
     found = _train(expert, held_out, inputs, truth, centres, pools)
     for g, each in enumerate(every):
         for name, weights in found._asdict().items():
-            getattr(each, name).copy_(weights[g])
+            getattr(each, name).copy_(weights.unflatten(0, (len(every), -1))[g])
     return experts
 
 
@@ -102,9 +102,9 @@ def _read(expert: Expert, held_out: HeldOut, recent: Recent, interactions: Tenso
 def _train(
     expert: Expert, held_out: HeldOut, inputs: Tensor, truth: Tensor, centres: Tensor, pools: list[Tensor]
 ) -> Layers:
-    """Networks [G, M, ...] for each of G pools of interactions, whose truth has these centres."""
+    """Networks [G M, ...], M for each of G pools of interactions, whose truth has these centres."""
     draws = generator_of(held_out.settings.seed, -7)
-    G, M, R, k, H = len(pools), expert.networks, ROWS, inputs.shape[-2], expert.hidden
+    n, R, k = len(pools) * expert.networks, ROWS, inputs.shape[-2]
 
     def uniform(*shape: int) -> Tensor:
         """Draws from [0, 1)."""
@@ -114,29 +114,32 @@ def _train(
         """Draws of deviation 1."""
         return torch.randn(shape, generator=draws, device="cpu").to(inputs)
 
-    layers = _started(expert, G, uniform)
+    layers = _started(expert, n, uniform)
     sets = torch.stack([mask[expert.seen] for mask in held_out.task.subsets.values()]).to(inputs)  # [S, k]
-    sizes = torch.tensor([len(pool) for pool in pools], device=inputs.device).view(-1, 1, 1)
-    longest = int(sizes.max())
-    pool = torch.stack([torch.nn.functional.pad(each, (0, longest - len(each))) for each in pools])
+    sizes = torch.tensor([len(pool) for pool in pools], device=inputs.device)
+    pool = torch.nn.utils.rnn.pad_sequence(pools, batch_first=True)
+    # A row of each of these for a network.
+    sizes, pool, centres = (each.repeat_interleave(expert.networks, 0) for each in (sizes, pool, centres))
     optimiser = torch.optim.AdamW(layers, lr=RATE, weight_decay=DECAY)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, STEPS)
     for _ in range(STEPS):
-        rows = pool.gather(1, (uniform(G, M, R) * sizes).long().clamp(max=longest - 1).flatten(1)).view(G, M, R)
-        moments = (uniform(G, M, R) * MOMENTS).long()
-        shown = sets[(uniform(G, M, R) * len(sets)).long()] * (uniform(G, M, R, k) >= HIDDEN_INPUTS)
-        x = inputs[rows, moments]  # [G, M, R, k, C]
+        # Draws are below 1, but their product may be rounded up.
+        rows = pool.gather(1, torch.minimum((uniform(n, R) * sizes[:, None]).long(), sizes[:, None] - 1))
+        moments = (uniform(n, R) * MOMENTS).long().clamp(max=MOMENTS - 1)
+        which = (uniform(n, R) * len(sets)).long().clamp(max=len(sets) - 1)
+        shown = sets[which] * (uniform(n, R, k) >= HIDDEN_INPUTS)
+        x = inputs[rows, moments]  # [n, R, k, C]
         noise = NOISE * normal(*x.shape) + BIAS * normal(*x.shape[:-1], 1)
         # Zeros are what is not measured: there is no noise without a sensor.
         x = (x + noise * (x != 0)) * shown.unsqueeze(-1)
-        keep = (uniform(G, M, R, H) >= DROPOUT) / (1 - DROPOUT)
+        keep = (uniform(n, R, expert.hidden) >= DROPOUT) / (1 - DROPOUT)
         with torch.enable_grad():
-            said = layers.read(x.flatten(-2), keep).view(G, M, R, *truth.shape[-2:])
+            said = layers.read(x.flatten(-2), keep).view(n, R, *truth.shape[-2:])
             wanted = (truth[rows, moments] - centres) / expert.unit
             counts = ~wanted.isnan()
             squares = torch.where(counts, said - wanted.nan_to_num(), 0).square()
             # Each horizon counts alike, however many interactions reach it; networks do not know of each other.
-            loss = (squares.sum((2, 4)) / counts.sum((2, 4)).clamp(min=1)).mean(-1).sum()
+            loss = (squares.sum((1, 3)) / counts.sum((1, 3)).clamp(min=1)).mean(-1).sum()
             optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
         _clip(layers)
@@ -145,11 +148,11 @@ def _train(
     return Layers(*(weights.detach() for weights in layers))
 
 
-def _started(expert: Expert, groups: int, uniform: Callable[..., Tensor]) -> Layers:
+def _started(expert: Expert, networks: int, uniform: Callable[..., Tensor]) -> Layers:
     """Random weights, of each layer within 1 / sqrt(its inputs); biases of 0."""
     started = []
     for name, weights in expert.layers._asdict().items():
-        shape = (groups, *weights.shape)
+        shape = (networks, *weights.shape[1:])
         size = 0.0 if name.endswith("bias") else 1 / math.sqrt(shape[-2])
         started.append(((2 * uniform(*shape) - 1) * size).requires_grad_())
     return Layers(*started)
