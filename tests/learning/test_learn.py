@@ -445,3 +445,11 @@ def test_a_channel_that_is_always_zero_is_learned_around() -> None:
     model = learn(known, sensors=["hand"], scan=6, steps=2, batch_size=4)
     assert "gradient" in model.report["stages"]
     assert model.forecast(model.prepare(known)[0], [0.1, math.inf]).mean.isfinite().all()
+
+
+def test_recordings_that_are_there_twice_are_named() -> None:
+    """Whoever is left out is then known."""
+    known = interactions(12)
+    model = learn(known.subset([*range(12), 3, 3, 7]), steps=0, scan=4)
+    named = [remark for remark in model.report["remarks"] if "are the same" in remark]
+    assert [remark.split(" are")[0] for remark in named] == ["recordings 3, 12, 13", "recordings 7, 14"]

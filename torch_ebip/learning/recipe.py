@@ -26,6 +26,7 @@ from torch_ebip.learning.procedure import Procedure
 from torch_ebip.learning.progress import Progress, Reporter
 from torch_ebip.learning.ranks import Ranks
 from torch_ebip.learning.settings import settings_for
+from torch_ebip.recordings.copies import copies
 from torch_ebip.recordings.demonstrations import Demonstrations
 
 
@@ -154,6 +155,10 @@ def learn(
         ranks,
     )
     run.prepare(arm, joints, basis)
+    run.remarks += [
+        f"recordings {', '.join(map(str, same))} are the same: what is left out is then known, and scores are too good"
+        for same in copies(known)
+    ]
     place = None if folder is None else Path(folder)
     if place is not None:
         done = run.enter(place)
