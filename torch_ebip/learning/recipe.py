@@ -156,7 +156,7 @@ def learn(
     )
     run.prepare(arm, joints, basis)
     run.remarks += [
-        f"recordings {', '.join(map(str, same))} are the same: what is left out is then known, and scores are too good"
+        f"recordings {', '.join(map(str, same))} are the same: what is left out is then known, scores are too good"
         for same in copies(known)
     ]
     place = None if folder is None else Path(folder)
