@@ -33,7 +33,8 @@ def bent(primitive: InteractionPrimitive, **options: object) -> InteractionEnsem
         for parameter in analogues.parameters():
             parameter.add_(0.3 * torch.randn(parameter.shape, generator=draws).to(parameter))
     parts = (follow.transpose(1, 2).flatten(-2), correct, width)
-    filter.readout = AnalogueReadout(analogues, *(part.to(like) for part in parts), levels=LEVELS)
+    surest = 0.06 * torch.rand(5, D, generator=draws).to(like)
+    filter.readout = AnalogueReadout(analogues, *(part.to(like) for part in parts), levels=LEVELS, surest=surest)
     return filter
 
 
@@ -50,8 +51,9 @@ def heard(
             part.copy_(0.3 * torch.randn(part.shape, generator=draws).to(part))
         elif name in ("scale", "unit"):
             part.copy_(0.5 + torch.rand(part.shape, generator=draws).to(part))
+    like = primitive.weights
     heed = torch.where(controlled.unsqueeze(-1), torch.rand(5, D, len(LEVELS), generator=draws), 0)
     bending = filter.readout
     parts = (bending.analogues, bending.follow, bending.correct, bending.width)
-    filter.readout = AnalogueReadout(*parts, levels=LEVELS, expert=expert, heed=heed.to(primitive.weights))
+    filter.readout = AnalogueReadout(*parts, levels=LEVELS, expert=expert, heed=heed.to(like), surest=bending.surest)
     return filter

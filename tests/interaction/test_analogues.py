@@ -269,15 +269,21 @@ def test_the_forecast_is_put_together_as_it_is_written() -> None:
     sure = np.sqrt((alone.variance / variance).detach().numpy())  # by DoF
     levels = torch.tensor(np.stack([np.interp(sure, places, row) for row in np.eye(3)], -2))  # [2, 3, J, D]
     assert 0.1 < float(levels[..., 1, :].mean()) < 0.9
+    some: list[float] = []
     for p, (first, second) in enumerate(((0, 0), (1, 2), (4, 4))):
         seconds = lead.seconds[:, p]
         assert p == 2 or float((seconds - ahead[p]).abs().max()) < 1e-6
         b, c, w = ((m[first] + m[second]) / 2 for m in (B, C, width))
         f, h, m = alone.mean[:, p], theirs[:, p], mean[:, p]
         followed = sum((levels[:, p, j] * (f - h)) @ b[j].T for j in range(3))
-        torch.testing.assert_close(said.mean[:, p], h + followed + (h - m) @ c.T)
+        least = (readout.surest[first] + readout.surest[second]).numpy() / 2
+        surer = torch.tensor(1 - np.minimum(sure[:, p] / least, 1) ** 2)
+        stacked = h + followed + (h - m) @ c.T
+        torch.testing.assert_close(said.mean[:, p], stacked + surer * (f - stacked))
+        some.append(float(surer.mean()))
         deviation = torch.stack([alone.variance[:, p].sqrt(), spread[:, p].sqrt(), variance[:, p].sqrt()], -1)
         torch.testing.assert_close(said.variance[:, p].sqrt(), (w * deviation).sum(-1))
+    assert 0.02 < sum(some) / 3 < 0.98
     moments = (said.weights.unsqueeze(-1) * said.members).sum(-2)
     torch.testing.assert_close(moments, said.mean)
     assert said.crps(said.mean.detach()).isfinite().all()
@@ -349,6 +355,8 @@ def test_what_does_not_fit_is_named() -> None:
         AnalogueReadout(analogues, eye.repeat(1, 1, 2), eye, width, levels=[0.5, 0.5])
     with pytest.raises(ValueError, match=r"follow must be \[5, 5, 10\] and finite, got \[5, 5, 5\]"):
         AnalogueReadout(analogues, eye, eye, width, levels=[0.5, 1.0])
+    with pytest.raises(ValueError, match=r"surest must be \[5, 5\] and not negative, got \[5\]"):
+        AnalogueReadout(analogues, eye, eye, width, surest=torch.ones(5))
     with pytest.raises(ValueError, match="seconds must increase"):
         AnalogueReadout(analogues, eye, eye, width, [0.5, 0.1, 0.2, 0.3, END])
     with pytest.raises(ValueError, match="no DoF is compared"):

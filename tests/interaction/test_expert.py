@@ -129,6 +129,7 @@ def test_the_forecast_is_put_together_as_it_is_written() -> None:
     y = torch.randn(2, 9, 5, generator=torch.Generator().manual_seed(1)).double()
     state = filter(y, generator=torch.Generator().manual_seed(0)).state
     ahead = [0.1, 0.3, END]
+    readout.surest.zero_()
     without = AnalogueReadout(
         readout.analogues, readout.follow, readout.correct, readout.width, levels=readout.levels.tolist()
     )

@@ -23,7 +23,7 @@ from torch_ebip.interaction.expert import Expert
 from torch_ebip.interaction.forecast import Forecast
 from torch_ebip.interaction.horizons import SECONDS, horizon_hats, level_hats
 from torch_ebip.interaction.present import Present
-from torch_ebip.interaction.readout import Lead, increasing, moved, root, widths_of
+from torch_ebip.interaction.readout import Lead, increasing, moved, root, surer, widths_of
 
 VOICES = ("filter", "analogues", "mean")
 
@@ -31,7 +31,9 @@ VOICES = ("filter", "analogues", "mean")
 class AnalogueReadout(nn.Module):
     """Mean g = h + sum_j B_j l_j (f - h) + C (h - m), deviation a sigma_f + b sigma_h + c sigma_m, by horizon.
 
-    With an expert, which says e, the mean is g + sum_j v_j l_j (e - g). l_j are the weights of J levels of
+    With an expert, which says e, g becomes g + sum_j v_j l_j (e - g). And where the filter is surer than it ever was
+    when all of this was learned, of thinned recordings, it is followed the more: the mean is g + s (f - g), with s
+    = 1 - (sigma_f / (r sigma_m))^2, 0 from r on. l_j are the weights of J levels of
     sigma_f / sigma_m, DoF by DoF, that sum to 1, see `level_hats`. h is the forecast of analogues, a weighted mean of
     demonstrations, f the filter's, m the mean of all demonstrations; sigma are their deviations. The filter's members
     keep their order and their weights: they are moved with the mean and stretched with the deviation.
@@ -47,6 +49,7 @@ class AnalogueReadout(nn.Module):
         levels: [J] increasing, of sigma_f / sigma_m; as the seconds. Default: one, B alike for all.
         expert: see `Expert`; default: none.
         heed: [K, D, J], v, between 0 and 1, if there is an expert; 0 for DoFs of which it says nothing.
+        surest: [K, D], r, not negative, the least sigma_f / sigma_m that was learned from; default: 0, that is s = 0.
 
     Raises:
         ValueError: shapes that do not fit, numbers that are not finite, negative widths, shares outside [0, 1],
@@ -78,6 +81,7 @@ class AnalogueReadout(nn.Module):
     follow: Tensor
     correct: Tensor
     width: Tensor
+    surest: Tensor
     seconds: Tensor
     levels: Tensor
     heed: Tensor | None
@@ -92,6 +96,7 @@ class AnalogueReadout(nn.Module):
         levels: Sequence[float] = (1.0,),
         expert: Expert | None = None,
         heed: Tensor | None = None,
+        surest: Tensor | None = None,
     ) -> None:
         super().__init__()
         places, widths = increasing("seconds", seconds, follow), increasing("levels", levels, follow)
@@ -105,6 +110,9 @@ class AnalogueReadout(nn.Module):
                 raise ValueError(f"{name} must be {list(shape)} and finite, got {list(values.shape)}")
         if not bool((width >= 0).all() & (width.sum(-1) > 0).all()):
             raise ValueError(f"width must not be negative, and above 0 together, got {float(width.min()):g}")
+        surest = width.new_zeros(K, D) if surest is None else surest
+        if surest.shape != (K, D) or not bool((surest >= 0).all() & surest.isfinite().all()):
+            raise ValueError(f"surest must be {[K, D]} and not negative, got {list(surest.shape)}")
         if (expert is None) != (heed is None):
             raise ValueError("an expert and its shares, heed, come together")
         if heed is not None and (heed.shape != (K, D, J) or not bool(((heed >= 0) & (heed <= 1)).all())):
@@ -114,6 +122,7 @@ class AnalogueReadout(nn.Module):
         self.register_buffer("follow", owned(follow))
         self.register_buffer("correct", owned(correct))
         self.register_buffer("width", owned(width))
+        self.register_buffer("surest", owned(surest))
         self.register_buffer("seconds", owned(places))
         self.register_buffer("levels", owned(widths))
 
@@ -148,6 +157,7 @@ class AnalogueReadout(nn.Module):
             share = (at @ self.heed.flatten(1)).view(*at.shape[:-1], D, -1)
             share = (share if level is None else share * level).sum(-1)
             stacked = torch.lerp(stacked, self.expert(present, lead), share)
+        stacked = torch.lerp(stacked, forecast.mean, surer(widths, at @ self.surest))
         of_each = torch.stack([widths.own, root(spread), widths.demonstrated], -1)
         deviation = ((at @ self.width.flatten(1)).view_as(of_each) * of_each).sum(-1)
         return moved(forecast, stacked, deviation, torch.ones_like(deviation), widths)
@@ -180,6 +190,7 @@ class AnalogueReadout(nn.Module):
         part.register_buffer("follow", self._by_level[:, dofs][..., dofs].flatten(-2))
         part.register_buffer("correct", self.correct[:, dofs][:, :, dofs])
         part.register_buffer("width", self.width[:, dofs])
+        part.register_buffer("surest", self.surest[:, dofs])
         if self.expert is not None and self.heed is not None:
             part.expert = self.expert.select(view)
             part.register_buffer("heed", self.heed[:, dofs])

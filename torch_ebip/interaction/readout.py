@@ -116,6 +116,19 @@ def widths_of(forecast: Forecast, variance: Tensor) -> Widths:
     return Widths(forecast.variance.clamp(min=least).sqrt(), root(variance))
 
 
+def surer(widths: Widths, surest: Tensor) -> Tensor:
+    """1 - (sigma_f / (r sigma_m))^2, [..., P, D], by how much a filter is surer than r: 0 where it is not.
+
+    Args:
+        widths: sigma_f of the filter, sigma_m of the demonstrations.
+        surest: r, [..., P, D]; 0: nothing is.
+    """
+    least = surest * widths.demonstrated
+    some = least > 0
+    ratio = torch.where(some, widths.own / torch.where(some, least, 1), 1)
+    return 1 - ratio.clamp(max=1).square()
+
+
 def root(variance: Tensor) -> Tensor:
     """Deviations [...] of variances [...], 0 of what is not above 0."""
     # The root of 0 has no gradient, and one that is infinite would make those of all parameters NaN.

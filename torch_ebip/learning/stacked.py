@@ -17,12 +17,16 @@ from torch_ebip.interaction.analogue_readout import VOICES, AnalogueReadout
 from torch_ebip.interaction.analogues import Analogues
 from torch_ebip.interaction.expert import Expert
 from torch_ebip.interaction.horizons import LEVELS
+from torch_ebip.interaction.readout import Widths, surer
 from torch_ebip.learning.analogues import fold_of, what_analogues_say
 from torch_ebip.learning.drawing import Drawn, asked_of, drawn_of
 from torch_ebip.learning.held_out import HeldOut
 from torch_ebip.learning.said import Said
 from torch_ebip.learning.shares import best_shares, trust
 from torch_ebip.learning.stacking import best_correction, best_width
+
+SUREST = 0.01
+"""Share of what was said that was surer than what counts as the surest."""
 
 
 class Corrected(NamedTuple):
@@ -175,17 +179,36 @@ def put_together(
         expert, heeded: as it will be used, and how much it counts; default: there is none.
     """
     layout, _, targets, ahead, _ = asked_of(held_out)
-    drawn = corrected.drawn if heeded is None else heeded.drawn
+    drawn, widths = corrected.drawn if heeded is None else heeded.drawn, Widths(said.own, said.demonstrated)
+    surest = drawn.new_zeros(said.place.shape[-1], layout.n_dofs)
     fold, modality = fold_of(held_out, said), layout.modality_of_dof.to(drawn.device)
     width, deviation = drawn.new_zeros(said.place.shape[-1], layout.n_dofs, len(VOICES)), torch.zeros_like(drawn)
     width[..., 0] = 1
     of_each = torch.stack([said.own, corrected.spread, said.demonstrated], -1)
     for m in sorted(set(modality[targets].tolist())):
         ours, here = modality[targets] == m, ((modality == m) & targets).nonzero().squeeze(-1)
+        least = _surest(said, ours)
+        surest[:, here] = least.unsqueeze(-1)
+        sure = surer(Widths(*(part[..., ours] for part in widths)), (said.place @ least).unsqueeze(-1))
+        drawn = drawn.clone()
+        drawn[..., ours] = torch.lerp(drawn[..., ours], said.towards[..., ours], sure)
         width[:, here], deviation[..., ours] = best_width(
             of_each[..., ours, :], said.place, (said.wanted - drawn)[..., ours], fold, held_out.settings.folds
         )
     heed = None if heeded is None else heeded.heed
-    parts = (corrected.follow, corrected.correct, width, ahead.tolist(), LEVELS, expert, heed)
+    parts = (corrected.follow, corrected.correct, width, ahead.tolist(), LEVELS, expert, heed, surest)
     readout = AnalogueReadout(analogues, *parts)
     return drawn_of(held_out, said, scored, readout, corrected.shares, drawn, deviation)
+
+
+def _surest(said: Said, ours: Tensor) -> Tensor:
+    """[S], as a share of how far demonstrations lie apart, of some targets, bool [D]; 0: nothing was measured."""
+    measured = ~said.wanted[..., ours].isnan() & (said.demonstrated[..., ours] > 0)
+    ratio = torch.where(measured, said.own[..., ours] / said.demonstrated[..., ours], torch.nan)
+    found = ratio.new_zeros(said.place.shape[-1])
+    for s in range(len(found)):
+        values = ratio[said.place[..., s] > 0.5]
+        values = values[~values.isnan()]
+        if len(values):
+            found[s] = values.quantile(SUREST)
+    return found
