@@ -33,8 +33,11 @@ def bent(primitive: InteractionPrimitive, **options: object) -> InteractionEnsem
         for parameter in analogues.parameters():
             parameter.add_(0.3 * torch.randn(parameter.shape, generator=draws).to(parameter))
     parts = (follow.transpose(1, 2).flatten(-2), correct, width)
-    surest = 0.06 * torch.rand(5, D, generator=draws).to(like)
-    filter.readout = AnalogueReadout(analogues, *(part.to(like) for part in parts), levels=LEVELS, surest=surest)
+    more = {
+        "surest": 0.06 * torch.rand(5, D, generator=draws).to(like),
+        "stretch": 0.5 + torch.rand(5, D, len(LEVELS), generator=draws).to(like),
+    }
+    filter.readout = AnalogueReadout(analogues, *(part.to(like) for part in parts), levels=LEVELS, **more)
     return filter
 
 
@@ -54,6 +57,7 @@ def heard(
     like = primitive.weights
     heed = torch.where(controlled.unsqueeze(-1), torch.rand(5, D, len(LEVELS), generator=draws), 0)
     bending = filter.readout
+    more = {"surest": bending.surest, "stretch": bending.stretch}
     parts = (bending.analogues, bending.follow, bending.correct, bending.width)
-    filter.readout = AnalogueReadout(*parts, levels=LEVELS, expert=expert, heed=heed.to(like), surest=bending.surest)
+    filter.readout = AnalogueReadout(*parts, levels=LEVELS, expert=expert, heed=heed.to(like), **more)
     return filter

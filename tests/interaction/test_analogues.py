@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from tests.conftest import interactions, small_primitive
 from tests.filtering.contract import FilterContract
-from tests.interaction.analogous import bent
+from tests.interaction.analogous import bent, heard
 from tests.interaction.test_ebip import silent
 from torch_ebip import Demonstrations, Forecast, InteractionPrimitive, LiveFilter, ebip
 from torch_ebip.filtering.protocols import View
@@ -282,7 +283,8 @@ def test_the_forecast_is_put_together_as_it_is_written() -> None:
         torch.testing.assert_close(said.mean[:, p], stacked + surer * (f - stacked))
         some.append(float(surer.mean()))
         deviation = torch.stack([alone.variance[:, p].sqrt(), spread[:, p].sqrt(), variance[:, p].sqrt()], -1)
-        torch.testing.assert_close(said.variance[:, p].sqrt(), (w * deviation).sum(-1))
+        stretch = (levels[:, p].transpose(-1, -2) * (readout.stretch[first] + readout.stretch[second]) / 2).sum(-1)
+        torch.testing.assert_close(said.variance[:, p].sqrt(), (w * deviation).sum(-1) * stretch)
     assert 0.02 < sum(some) / 3 < 0.98
     moments = (said.weights.unsqueeze(-1) * said.members).sum(-2)
     torch.testing.assert_close(moments, said.mean)
@@ -357,6 +359,8 @@ def test_what_does_not_fit_is_named() -> None:
         AnalogueReadout(analogues, eye, eye, width, levels=[0.5, 1.0])
     with pytest.raises(ValueError, match=r"surest must be \[5, 5\] and not negative, got \[5\]"):
         AnalogueReadout(analogues, eye, eye, width, surest=torch.ones(5))
+    with pytest.raises(ValueError, match=r"stretch must be \[5, 5, 1\] and positive, got \[5, 5, 1\]"):
+        AnalogueReadout(analogues, eye, eye, width, stretch=torch.zeros(5, 5, 1))
     with pytest.raises(ValueError, match="seconds must increase"):
         AnalogueReadout(analogues, eye, eye, width, [0.5, 0.1, 0.2, 0.3, END])
     with pytest.raises(ValueError, match="no DoF is compared"):
@@ -449,13 +453,17 @@ def test_what_is_forecast_together_is_found_through_others() -> None:
     assert readout.together(torch.tensor([True, False, False, False, False])).tolist() == [True] * 3 + [False] * 2
 
 
-def test_an_empty_batch_is_no_error() -> None:
+@pytest.mark.parametrize("make", [bent, heard])
+def test_an_empty_batch_is_no_error(make: Callable[..., InteractionEnsembleFilter]) -> None:
     primitive = small_primitive()
-    filter = bent(primitive, weigh=True)
+    filter = make(primitive, weigh=True)
     state = filter(torch.zeros(0, 4, primitive.layout.n_dofs)).state
     for ahead in ([], [0.1, END]):
         assert filter.forecast(state, ahead=ahead).mean.shape == (0, len(ahead), primitive.layout.n_dofs)
     assert filter.attribution(state).shape == (0, len(primitive))
+    one = filter.initial_state((1,))
+    assert filter.forecast(one, ahead=[]).mean.shape == (1, 0, primitive.layout.n_dofs)
+    assert filter.forecast(one, torch.zeros(0)).mean.shape == (1, 0, primitive.layout.n_dofs)
 
 
 def test_no_horizons_are_no_error() -> None:

@@ -18,7 +18,7 @@ from torch_ebip.filtering.protocols import View
 from torch_ebip.filtering.updates.recent import Line
 from torch_ebip.interaction import InteractionEnsembleFilter
 from torch_ebip.interaction.analogue_readout import AnalogueReadout
-from torch_ebip.interaction.expert import FAR, SLOWER, Expert
+from torch_ebip.interaction.expert import FAR, LIMIT, SLOWER, Expert
 from torch_ebip.interaction.horizons import LEVELS, horizon_hats, level_hats
 from torch_ebip.interaction.present import Present
 from torch_ebip.interaction.readout import Lead, lead_of, widths_of
@@ -88,7 +88,8 @@ def test_the_network_is_its_formula() -> None:
                 a = h @ parts[name][m] + parts[f"{name}_bias"][m, 0]
                 h = a / (1 + np.exp(-a))
             every.append(h @ parts["last"][m] + parts["last_bias"][m, 0] + flat @ parts["direct"][m])
-        expected = np.mean(every, 0).reshape(5, -1) * parts["unit"] + parts["centre"]
+        within = np.clip(np.mean(every, 0).reshape(5, -1), -LIMIT, LIMIT)
+        expected = within * parts["unit"] + parts["centre"]
         np.testing.assert_allclose(said[r], expected, rtol=1e-10)
 
 
@@ -109,16 +110,18 @@ def test_it_says_what_the_network_says_at_the_horizons_and_between_them_follows_
         return torch.stack(paths)
 
     network, dofs = expert.read(expert.inputs(before)), expert.said
-    horizons = expert.seconds.tolist()
-    torch.testing.assert_close(said(horizons)[..., dofs], network)
+    horizons, left = expert.seconds.tolist(), (1 - phase) / velocity
     others = [d for d in range(5) if d not in dofs.tolist()]
-    for p, seconds in enumerate(horizons):
-        torch.testing.assert_close(said(horizons)[:, p, others], mean(seconds)[:, others], atol=1e-4, rtol=1e-4)
-    off = [network[:, k] - mean(seconds)[:, dofs] for k, seconds in enumerate(horizons)]
-    between = said([0.4])[:, 0, dofs] - mean(0.4)[:, dofs]
-    torch.testing.assert_close(between, 0.4 * off[1] + 0.6 * off[2], atol=1e-4, rtol=1e-4)
-    now = said([0.0])[:, 0, dofs] - mean(0.0)[:, dofs]
-    torch.testing.assert_close(now, off[0], atol=1e-4, rtol=1e-4)
+    off = torch.stack([network[:, k] - mean(seconds)[:, dofs] for k, seconds in enumerate(horizons)], 1)
+    for seconds in (0.0, 0.1, 0.25, 0.4, 1.0, 3.0, END):
+        found, there = said([seconds])[:, 0], mean(seconds)
+        torch.testing.assert_close(found[:, others], there[:, others], atol=1e-4, rtol=1e-4)
+        for row in range(4):
+            # What lies behind the end is asked as what is left until then.
+            asked = min(seconds, float(left[row]))
+            part = [np.interp(asked, horizons[:-1], off[row, :-1, i]) for i in range(len(dofs))]
+            expected = off[row, -1].numpy() if seconds == END else np.array(part)
+            np.testing.assert_allclose(found[row, dofs] - there[row, dofs], expected, atol=1e-4, rtol=1e-4)
 
 
 def test_the_forecast_is_put_together_as_it_is_written() -> None:
@@ -131,7 +134,12 @@ def test_the_forecast_is_put_together_as_it_is_written() -> None:
     ahead = [0.1, 0.3, END]
     readout.surest.zero_()
     without = AnalogueReadout(
-        readout.analogues, readout.follow, readout.correct, readout.width, levels=readout.levels.tolist()
+        readout.analogues,
+        readout.follow,
+        readout.correct,
+        readout.width,
+        levels=readout.levels.tolist(),
+        stretch=readout.stretch,
     )
     found = filter.forecast(state, ahead=ahead)
     filter.readout = without
@@ -144,10 +152,40 @@ def test_the_forecast_is_put_together_as_it_is_written() -> None:
     levels = level_hats(widths_of(plain, variance), torch.tensor(LEVELS).double())
     at = horizon_hats(lead, readout.seconds)
     share = torch.einsum("bpk,kdj,bpdj->bpd", at, readout.heed, levels)
+    share = share * readout.expert.believed(filter.present(state).before)[:, None, None]
     e = readout.expert(filter.present(state), lead)
     torch.testing.assert_close(found.mean, g.mean + share * (e - g.mean))
     torch.testing.assert_close(found.variance, g.variance)
     torch.testing.assert_close(found.members.mean(-2), found.mean, atol=0.5, rtol=0.5)
+
+
+def test_it_is_believed_as_far_as_what_it_reads() -> None:
+    """While sensors fade it is heard less; what was never there, or is long forgotten, does not matter to it."""
+    primitive = small_primitive(torch.float64)
+    filter = heard(primitive)
+    expert, y = filter.readout.expert, torch.zeros(1, 5).double()
+    observed = torch.tensor([True, True, False, False, False])
+    state, live = filter.initial_state(), []
+    for step in range(150):
+        state = filter.predict(state, 1 / 30)
+        if step < 30:
+            state, _ = filter.update(state, y[0], observed)
+        elif step >= 60:  # one of the two goes on
+            state, _ = filter.update(state, y[0], observed & torch.tensor([True] + [False] * 4))
+        live.append(float(expert.believed(filter.present(state).before).detach()))
+    assert min(live[:30]) > 0.99
+    assert max(live[38:80]) < 0.2  # a quarter of a second of silence
+    assert live[-1] > 0.99
+
+
+def test_it_does_not_speak_beyond_what_was_demonstrated() -> None:
+    """Whatever it reads, within four deviations."""
+    expert, before = expert_of(small_primitive(torch.float64)), lines()
+    far = before._replace(
+        value=1e9 * before.value, velocity=-1e9 * before.velocity, belief=torch.ones_like(before.belief)
+    )
+    off = (expert.read(expert.inputs(far)) - expert.centre) / expert.unit
+    assert float(off.abs().max()) <= 4 + 1e-9
 
 
 def test_what_is_not_seen_changes_nothing() -> None:
@@ -188,6 +226,15 @@ def test_what_does_not_fit_is_named() -> None:
         AnalogueReadout(*parts, levels=LEVELS, expert=readout.expert, heed=readout.heed + 1)
     with pytest.raises(ValueError, match="DoFs that are read and DoFs that are said"):
         Expert.of(primitive, controlled & ~controlled, controlled)
+    for wrong, message in (
+        ({"windows": ()}, "no window"),
+        ({"windows": (-1.0,)}, "window must be a positive"),
+        ({"hidden": 0}, "hidden must be"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Expert.of(primitive, ~controlled, controlled, **wrong)
+    with pytest.raises(ValueError, match="seen must be"):
+        Expert.of(primitive, torch.ones(3, dtype=torch.bool), controlled)
     state = heard(primitive, slower=()).initial_state()
     with pytest.raises(ValueError, match="windows of"):
         heard(primitive, slower=()).forecast(state, ahead=[0.1])

@@ -29,14 +29,16 @@ VOICES = ("filter", "analogues", "mean")
 
 
 class AnalogueReadout(nn.Module):
-    """Mean g = h + sum_j B_j l_j (f - h) + C (h - m), deviation a sigma_f + b sigma_h + c sigma_m, by horizon.
+    """Mean g = h + sum_j B_j l_j (f - h) + C (h - m), deviation (a sigma_f + b sigma_h + c sigma_m) sum_j t_j l_j.
 
-    With an expert, which says e, g becomes g + sum_j v_j l_j (e - g). And where the filter is surer than it ever was
-    when all of this was learned, of thinned recordings, it is followed the more: the mean is g + s (f - g), with s
-    = 1 - (sigma_f / (r sigma_m))^2, 0 from r on. l_j are the weights of J levels of
-    sigma_f / sigma_m, DoF by DoF, that sum to 1, see `level_hats`. h is the forecast of analogues, a weighted mean of
-    demonstrations, f the filter's, m the mean of all demonstrations; sigma are their deviations. The filter's members
-    keep their order and their weights: they are moved with the mean and stretched with the deviation.
+    All by horizon. With an expert, which says e, g becomes g + sum_j v_j l_j (e - g), as far as the expert believes
+    what it reads. And where the filter is surer than it ever was when all of this was learned, of thinned recordings,
+    it is followed the more: the mean is g + s (f - g), s = 1 - (sigma_f / (r sigma_m))^2, 0 from r on.
+
+    l_j are the weights of J levels of sigma_f / sigma_m, DoF by DoF, that sum to 1, see `level_hats`. h is the
+    forecast of analogues, a weighted mean of demonstrations, f the filter's, m the mean of all demonstrations; sigma
+    are their deviations. The filter's members keep their order and their weights: they are moved with the mean and
+    stretched with the deviation.
 
     Args:
         analogues: over the same layout.
@@ -50,6 +52,7 @@ class AnalogueReadout(nn.Module):
         expert: see `Expert`; default: none.
         heed: [K, D, J], v, between 0 and 1, if there is an expert; 0 for DoFs of which it says nothing.
         surest: [K, D], r, not negative, the least sigma_f / sigma_m that was learned from; default: 0, that is s = 0.
+        stretch: [K, D, J], t, positive: one that knows little errs more than its voices say. Default: 1.
 
     Raises:
         ValueError: shapes that do not fit, numbers that are not finite, negative widths, shares outside [0, 1],
@@ -82,6 +85,7 @@ class AnalogueReadout(nn.Module):
     correct: Tensor
     width: Tensor
     surest: Tensor
+    stretch: Tensor
     seconds: Tensor
     levels: Tensor
     heed: Tensor | None
@@ -97,6 +101,7 @@ class AnalogueReadout(nn.Module):
         expert: Expert | None = None,
         heed: Tensor | None = None,
         surest: Tensor | None = None,
+        stretch: Tensor | None = None,
     ) -> None:
         super().__init__()
         places, widths = increasing("seconds", seconds, follow), increasing("levels", levels, follow)
@@ -110,6 +115,9 @@ class AnalogueReadout(nn.Module):
                 raise ValueError(f"{name} must be {list(shape)} and finite, got {list(values.shape)}")
         if not bool((width >= 0).all() & (width.sum(-1) > 0).all()):
             raise ValueError(f"width must not be negative, and above 0 together, got {float(width.min()):g}")
+        stretch = width.new_ones(K, D, J) if stretch is None else stretch
+        if stretch.shape != (K, D, J) or not bool((stretch > 0).all() & stretch.isfinite().all()):
+            raise ValueError(f"stretch must be {[K, D, J]} and positive, got {list(stretch.shape)}")
         surest = width.new_zeros(K, D) if surest is None else surest
         if surest.shape != (K, D) or not bool((surest >= 0).all() & surest.isfinite().all()):
             raise ValueError(f"surest must be {[K, D]} and not negative, got {list(surest.shape)}")
@@ -123,6 +131,7 @@ class AnalogueReadout(nn.Module):
         self.register_buffer("correct", owned(correct))
         self.register_buffer("width", owned(width))
         self.register_buffer("surest", owned(surest))
+        self.register_buffer("stretch", owned(stretch))
         self.register_buffer("seconds", owned(places))
         self.register_buffer("levels", owned(widths))
 
@@ -154,13 +163,21 @@ class AnalogueReadout(nn.Module):
         every = (both @ torch.cat([self.follow, self.correct], -1).flatten(0, 1).T).view(*at.shape, D)
         stacked = theirs + (at.unsqueeze(-2) @ every).squeeze(-2)
         if self.expert is not None and self.heed is not None:
-            share = (at @ self.heed.flatten(1)).view(*at.shape[:-1], D, -1)
-            share = (share if level is None else share * level).sum(-1)
+            share = (
+                self._weighed(self.heed, at, level)
+                * self.expert.believed(self.expert.before(present))[..., None, None]
+            )
             stacked = torch.lerp(stacked, self.expert(present, lead), share)
         stacked = torch.lerp(stacked, forecast.mean, surer(widths, at @ self.surest))
         of_each = torch.stack([widths.own, root(spread), widths.demonstrated], -1)
         deviation = ((at @ self.width.flatten(1)).view_as(of_each) * of_each).sum(-1)
+        deviation = deviation * self._weighed(self.stretch, at, level)
         return moved(forecast, stacked, deviation, torch.ones_like(deviation), widths)
+
+    def _weighed(self, values: Tensor, at: Tensor, level: Tensor | None) -> Tensor:
+        """[..., P, D], of values [K, D, J] by the weights of horizons [..., P, K] and of levels [..., P, D, J]."""
+        found = (at @ values.flatten(1)).view(*at.shape[:-1], *values.shape[1:])
+        return (found if level is None else found * level).sum(-1)
 
     def together(self, dofs: Tensor) -> Tensor:
         """Those that must be forecast for some DoFs, bool [D], to be: what they are corrected by is among them."""
@@ -191,6 +208,7 @@ class AnalogueReadout(nn.Module):
         part.register_buffer("correct", self.correct[:, dofs][:, :, dofs])
         part.register_buffer("width", self.width[:, dofs])
         part.register_buffer("surest", self.surest[:, dofs])
+        part.register_buffer("stretch", self.stretch[:, dofs])
         if self.expert is not None and self.heed is not None:
             part.expert = self.expert.select(view)
             part.register_buffer("heed", self.heed[:, dofs])

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_ebip.common.ambient import owned
+from torch_ebip.common.arguments import as_count, as_mask, as_number
 from torch_ebip.common.brief import brief
 from torch_ebip.common.modules import sharing
 from torch_ebip.filtering.protocols import View
@@ -33,6 +34,10 @@ NETWORKS = 2
 """That are trained alike from different starts; what they say is averaged."""
 FAR = 5.0
 """Deviations beyond which all is equally far."""
+LIMIT = 4.0
+"""Deviations of the targets within which it speaks."""
+GONE = 2.0
+"""Of the slowest window: mean age of samples from which on a sensor that fell silent counts as one never seen."""
 
 
 class Layers(NamedTuple):
@@ -79,7 +84,8 @@ class Expert(nn.Module):
     horizon k, and a_k the weights of `horizon_hats`. So at horizon k it says e_k, and between horizons how far it is
     off the mean is linear. The network's inputs are, of each DoF that is seen and each window, value and velocity of
     a line in deviations, held within 5, its samples' mean age and 1; all of them times how far the present is
-    believed, so that what is not seen is 0.
+    believed, so that what is not seen is 0. It speaks within 4 deviations of the targets, and is believed as far as
+    the least of the sensors that it lately read, see `believed`.
 
     Args:
         path: of a single demonstration, the mean.
@@ -92,7 +98,8 @@ class Expert(nn.Module):
         networks: how many.
 
     Raises:
-        ValueError: a path of several demonstrations, no DoF that it reads or speaks of, seconds that do not increase.
+        ValueError: a path of several demonstrations, no DoF that it reads or speaks of, seconds that do not increase,
+            windows that are not positive, no units or networks.
 
     Example:
         >>> import torch
@@ -132,8 +139,11 @@ class Expert(nn.Module):
                 f"a path of one demonstration, DoFs that are read and DoFs that are said are needed, got "
                 f"{len(path.cells)}, {len(seen)} and {len(said)}"
             )
+        if not len(windows):
+            raise ValueError("no window: an expert reads lines through at least one")
         new, k, K, T = path.cells.new_zeros, len(seen), len(places), len(said)
-        self.path, self.windows, self.hidden, self.networks = path, tuple(windows), hidden, networks
+        self.path, self.windows = path, tuple(as_number("window", window, 0, above=True) for window in windows)
+        self.hidden, self.networks = as_count("hidden", hidden), as_count("networks", networks)
         self.register_buffer("pace", owned(pace))
         self.register_buffer("seen", owned(seen), persistent=False)
         self.register_buffer("said", owned(said), persistent=False)
@@ -177,7 +187,8 @@ class Expert(nn.Module):
         """
         table = DemonstrationTable.of(primitive)
         mean = DemonstrationTable(table.values.mean(0, keepdim=True), table.slopes.mean(0, keepdim=True))
-        reads, says = (mask.nonzero().squeeze(-1).to(primitive.weights.device) for mask in (seen, said))
+        masks = (as_mask(name, mask, table.n_dofs) for name, mask in (("seen", seen), ("said", said)))
+        reads, says = (mask.nonzero().squeeze(-1).to(primitive.weights.device) for mask in masks)
         return cls(mean, primitive.phase_velocity.mean(), reads, says, seconds, windows, hidden, networks)
 
     @property
@@ -202,7 +213,21 @@ class Expert(nn.Module):
         layers = self.layers
         flat = inputs.reshape(-1, layers.first.shape[-2]).expand(self.networks, -1, -1)
         said = layers.read(flat).mean(0).view(*inputs.shape[:-2], *self.unit.shape)
-        return torch.addcmul(self.centre, said, self.unit)
+        return torch.addcmul(self.centre, said.clamp(-LIMIT, LIMIT), self.unit)
+
+    def believed(self, before: Line) -> Tensor:
+        """[...], from 0 to 1, how far the present is believed of the DoF that it reads of which that is least.
+
+        A sensor that fades is none that was never there, which networks learned to do without: until it is forgotten
+        nobody knows what they make of it.
+
+        Args:
+            before: lines [..., W, D] through all windows.
+        """
+        now, age = (part.index_select(-1, self.seen) for part in (before.belief[..., 0, :], before.age[..., -1, :]))
+        # Gone from twice the slowest window on, wholly half a window later; never there: without an age.
+        there = torch.where(age > 0, 1 - (2 * (age / self.windows[-1] - GONE)).clamp(0, 1), 0)
+        return (1 - there * (1 - now)).amin(-1)
 
     def forward(self, present: Present, lead: Lead) -> Tensor:
         """Forecasts [..., P, D]; differentiable.
@@ -214,20 +239,24 @@ class Expert(nn.Module):
         Raises:
             ValueError: the update remembers other windows.
         """
-        before = present.before
-        if before is None or before.value.shape[-2] != len(self.windows):
-            raise ValueError(f"the expert reads what was seen in windows of {self.windows} s: `Recent` of these")
+        before = self.before(present)
         said = self.read(self.inputs(before)).index_select(-1, self.place)  # [..., K, D]
         phase, K = present.phase.unsqueeze(-1), len(self.seconds)
-        if lead.asked is None:
-            of = torch.cat([self._after(phase, self.seconds), lead.phase], -1)
-        else:
-            # As it was trained: so many seconds, also where the filter takes the end to be nearer.
-            of = self._after(phase, torch.cat([self.seconds, lead.asked.to(self.seconds)]))
-            lead = lead._replace(seconds=lead.asked.to(of), end=lead.asked.isinf().to(of))
-        mean = self._mean(of)
+        asked = lead.phase if lead.asked is None else torch.where(lead.end > 0, 1, phase + self.pace * lead.seconds)
+        mean = self._mean(torch.cat([self._after(phase, self.seconds), asked.clamp(0, 1)], -1))
         off = torch.where(self.spoken, said - mean[..., :K, :], 0)
         return mean[..., K:, :] + horizon_hats(lead, self.seconds) @ off
+
+    def before(self, present: Present) -> Line:
+        """The lines [..., W, D] that it reads, of the ``present``.
+
+        Raises:
+            ValueError: the update remembers other windows.
+        """
+        lines = present.before
+        if lines is None or lines.value.shape[-2] != len(self.windows):
+            raise ValueError(f"the expert reads what was seen in windows of {self.windows} s: `Recent` of these")
+        return lines
 
     def _after(self, phase: Tensor, seconds: Tensor) -> Tensor:
         """Phases [..., P] so many seconds [P] after a phase [..., 1], at the mean pace; 1 where the end is asked."""

@@ -41,9 +41,13 @@ LIKELIHOOD = 0.1
 
 
 def moments_of(held_out: HeldOut) -> Tensor:
-    """[K], shares of an interaction at which its present is compared, within the settings' horizons."""
+    """[K], shares of an interaction at which its present is compared: within the settings' horizons, and before.
+
+    At first nothing is known but where all begins: of that read-outs learn how wide they must be then.
+    """
     low, high = held_out.settings.horizons
-    return torch.linspace(low, min(high + 0.02, 1.0), MOMENTS, device="cpu")
+    first = torch.tensor([0.0, low / 2], device="cpu")
+    return torch.cat([first, torch.linspace(low, min(high + 0.02, 1.0), MOMENTS - 2, device="cpu")])
 
 
 @without_autocast

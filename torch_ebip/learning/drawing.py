@@ -100,6 +100,9 @@ def drawn_of(
     """What a read-out comes to, of forecasts ``drawn`` less the mean and their ``deviation`` [R, K, P, D]."""
     _, objective, _, _, names = asked_of(held_out)
     told = torch.isin(said.interaction, scored.to(said.interaction.device))
+    if said.counted is not None:
+        drawn, deviation = drawn[:, said.counted], deviation[:, said.counted]
+        said = said._replace(wanted=said.wanted[:, said.counted], towards=said.towards[:, said.counted])
     error = (drawn - said.wanted)[told]
     after = scores_of(tally(held_out, error * objective.scale, deviation[told] * objective.scale))
     each = gaussian_crps(error, deviation[told].square(), torch.zeros_like(error)).nanmean((0, 1, 3))

@@ -82,6 +82,9 @@ def learn_readout(
     if expert and len(task.primitive) < ENOUGH:
         remarks.append(f"no expert: {len(task.primitive)} demonstrations, a network needs {ENOUGH}")
         expert = False
+    if expert and task.objective.ahead is not None and len(task.objective.ahead) < 2:
+        remarks.append("no expert: it needs horizons in seconds, and only the end is asked for")
+        expert = False
     if analogues is not None:
         filter.analysis.recent = recent_of(task.primitive, slower=SLOWER if expert else ())
     with torch.no_grad():

@@ -30,6 +30,7 @@ class Said(NamedTuple):
         mean: [R, K, P, D], of the demonstrations, units of the scale.
         doubt: [R, K], how surprised the filter was, see `InteractionSurprise.doubt`; 0 if it never is.
         present: [R, K], what it knew of the present; None where it remembers nothing of late.
+        counted: bool [K], the moments that scores are of, which are within the settings' horizons; None: all.
     """
 
     interaction: Tensor
@@ -42,6 +43,7 @@ class Said(NamedTuple):
     mean: Tensor
     doubt: Tensor
     present: Present | None = None
+    counted: Tensor | None = None
 
     def __repr__(self) -> str:
         return brief(self)
@@ -94,4 +96,5 @@ def what_it_says(
     together = [part for share in gathered for part in share]
     device = primitive.weights.device
     found: Said = map_state(lambda *tensors: torch.cat(tensors).to(device), *together)
-    return found
+    low = held_out.settings.horizons[0]
+    return found if shares is None else found._replace(counted=(shares >= low - 1e-6).to(device))

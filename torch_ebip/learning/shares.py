@@ -20,6 +20,8 @@ DOUBT, CERTAIN = 1.5, 4.0
 """Standard errors of a gain below which it counts for nothing, and above which it counts for all of it."""
 FEWEST = 50
 """Forecasts that decide about a deviation, at least."""
+NEAR = 0.4
+"""Weight of a horizon, or of a level, from which on what was said is said of it."""
 FACTORS = (0.3, 5.0)
 """Between which deviations are stretched."""
 
@@ -109,6 +111,34 @@ def standard_errors(interaction: Tensor, wanted: Tensor, drawn: Tensor, weight: 
     return float(each.mean() / (each.std() / len(each) ** 0.5).clamp(min=1e-12))
 
 
+def stretching(miss: Tensor, place: Tensor, level: Tensor, fold: Tensor) -> tuple[Tensor, Tensor]:
+    """`widening` for each of J levels of how little a filter knows: factors [S, J], and [R, S, J] without each fold.
+
+    A level of which too little was seen has the factor of the one below it, or 1 where that is less: who knows less
+    does not err less.
+
+    Args:
+        miss: [R, K, P, D], absolute errors in deviations; NaN: not measured.
+        place: [R, K, P, S], see `horizon_hats`.
+        level: [R, K, P, D, J], see `level_hats`.
+        fold: int64 [R].
+    """
+    whole = miss.new_ones(place.shape[-1], level.shape[-1])
+    each = miss.new_ones(len(fold), place.shape[-1], level.shape[-1])
+    before = torch.zeros_like(whole[:, 0]), torch.zeros_like(each[..., 0])
+    for j in range(level.shape[-1]):
+        there = level[..., j] > NEAR
+        found = widening(torch.where(there, miss, torch.nan), place, fold)
+        enough = torch.stack(
+            [(there & (place[..., s : s + 1] > NEAR) & ~miss.isnan()).sum() for s in range(len(whole))]
+        )
+        few = enough < 2 * FEWEST  # one of the folds may have none of them
+        for values, now, least in zip((whole, each), found, before, strict=True):
+            values[..., j] = torch.where(few, least.clamp(min=1), now)
+        before = whole[:, j], each[..., j]
+    return whole, each
+
+
 def widening(miss: Tensor, place: Tensor, fold: Tensor) -> tuple[Tensor, Tensor]:
     """Factors [S] on deviations so that 95 % lie within 1.96 of them; [R, S] without its own fold.
 
@@ -119,7 +149,7 @@ def widening(miss: Tensor, place: Tensor, fold: Tensor) -> tuple[Tensor, Tensor]
     """
     S = place.shape[-1]
     # Where a horizon lies between two of those that are learned it says something of both.
-    near = place > 0.4
+    near = place > NEAR
 
     def factors(rows: Tensor) -> Tensor:
         """Of some of the forecasts."""

@@ -22,7 +22,7 @@ from torch_ebip.learning.analogues import fold_of, what_analogues_say
 from torch_ebip.learning.drawing import Drawn, asked_of, drawn_of
 from torch_ebip.learning.held_out import HeldOut
 from torch_ebip.learning.said import Said
-from torch_ebip.learning.shares import best_shares, trust
+from torch_ebip.learning.shares import best_shares, stretching, trust
 from torch_ebip.learning.stacking import best_correction, best_width
 
 SUREST = 0.01
@@ -130,7 +130,9 @@ def learn_heed(held_out: HeldOut, experts: Sequence[Expert], said: Said, drawn: 
     voice = torch.empty_like(drawn)
     for f, expert in enumerate(experts):
         voice[fold == f] = expert.read(inputs[fold == f]) / objective.scale
-    apart = voice - said.mean - drawn
+    # Where the filter takes a horizon to lie behind the end it is asked of a nearer one.
+    voice = said.place @ voice
+    apart = (voice - said.mean - drawn) * experts[0].believed(said.present.before)[..., None, None]
     S, J = said.place.shape[-1], said.level.shape[-1]
     heed, together = drawn.new_zeros(S, layout.n_dofs, J), drawn.clone()
     shares: dict[str, Any] = {}
@@ -181,6 +183,7 @@ def put_together(
     layout, _, targets, ahead, _ = asked_of(held_out)
     drawn, widths = corrected.drawn if heeded is None else heeded.drawn, Widths(said.own, said.demonstrated)
     surest = drawn.new_zeros(said.place.shape[-1], layout.n_dofs)
+    stretch = drawn.new_ones(*surest.shape, said.level.shape[-1])
     fold, modality = fold_of(held_out, said), layout.modality_of_dof.to(drawn.device)
     width, deviation = drawn.new_zeros(said.place.shape[-1], layout.n_dofs, len(VOICES)), torch.zeros_like(drawn)
     width[..., 0] = 1
@@ -192,11 +195,13 @@ def put_together(
         sure = surer(Widths(*(part[..., ours] for part in widths)), (said.place @ least).unsqueeze(-1))
         drawn = drawn.clone()
         drawn[..., ours] = torch.lerp(drawn[..., ours], said.towards[..., ours], sure)
-        width[:, here], deviation[..., ours] = best_width(
-            of_each[..., ours, :], said.place, (said.wanted - drawn)[..., ours], fold, held_out.settings.folds
-        )
+        error, level = (said.wanted - drawn)[..., ours], said.level[..., ours, :]
+        width[:, here], wide = best_width(of_each[..., ours, :], said.place, error, fold, held_out.settings.folds)
+        whole, each = stretching(error.abs() / wide.clamp(min=1e-12), said.place, level, fold)
+        stretch[:, here] = whole.unsqueeze(1)
+        deviation[..., ours] = wide * torch.einsum("rkps,rsj,rkpdj->rkpd", said.place, each, level)
     heed = None if heeded is None else heeded.heed
-    parts = (corrected.follow, corrected.correct, width, ahead.tolist(), LEVELS, expert, heed, surest)
+    parts = (corrected.follow, corrected.correct, width, ahead.tolist(), LEVELS, expert, heed, surest, stretch)
     readout = AnalogueReadout(analogues, *parts)
     return drawn_of(held_out, said, scored, readout, corrected.shares, drawn, deviation)
 
