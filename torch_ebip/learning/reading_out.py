@@ -27,6 +27,9 @@ from torch_ebip.learning.said import what_it_says
 from torch_ebip.learning.stacked import learn_correction, learn_heed, put_together
 from torch_ebip.learning.stages import Scores
 
+PAYS = 0.01
+"""Share of the CRPS that an expert must take off: it costs time, and what is chosen for a gain gains less later."""
+
 Makes: TypeAlias = "Callable[[InteractionPrimitive, Tensor], Analogues]"
 """Analogues of a primitive that compare some DoFs, bool [D]."""
 
@@ -106,7 +109,7 @@ def learn_readout(
             pays = bool((heeded.heed > 0).any())
             with_it = put_together(held_out, head, corrections, said, scored, network, heeded) if pays else stacked
             scores["expert"] = with_it.scores
-            heard = with_it.scores["crps"] < stacked.scores["crps"]
+            heard = with_it.scores["crps"] < (1 - PAYS) * stacked.scores["crps"]
             told["expert"] = _told(heard, with_it, stacked, heeded.shares)
             if heard:
                 stacked = with_it
