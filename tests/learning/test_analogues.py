@@ -34,6 +34,7 @@ from torch_ebip.learning.configuration import Task
 from torch_ebip.learning.held_out import HeldOut, Trial
 from torch_ebip.learning.recently import recent_sums
 from torch_ebip.learning.said import what_it_says
+from torch_ebip.learning.shares import stretching
 from torch_ebip.learning.stacking import FIXED, PULLS, best_correction, best_width
 
 QUICK = {"steps": 0, "scan": 6}
@@ -93,6 +94,19 @@ def test_deviations_hold_what_they_say(bent: InteractionModel) -> None:
         truth = torch.stack([trajectory[at + round(0.25 * 30), -1], trajectory[-1, -1]])
         inside.append(((said.mean[at, :, -1] - truth).abs() <= 1.96 * said.variance[at, :, -1].sqrt()).double())
     assert 0.87 <= float(torch.stack(inside).mean()) <= 1.0
+
+
+def test_who_knows_little_is_not_sure(bent: InteractionModel) -> None:
+    """At the first sample, and of sensors that fell silent early, the intervals of the end still hold it."""
+    first, silent = [], []
+    for trajectory in bending(60, seed=6):
+        end, shown = trajectory[-1, -1], trajectory.clone()
+        shown[round(0.3 * len(trajectory)) :, :2] = torch.nan
+        for where, values, at in ((first, trajectory, 0), (silent, shown, round(0.8 * len(trajectory)))):
+            said = bent.forecast(values, [math.inf])
+            where.append(bool((said.mean[at, 0, -1] - end).abs() <= 1.96 * said.variance[at, 0, -1].sqrt()))
+    assert np.mean(first) > 0.85
+    assert np.mean(silent) > 0.85
 
 
 def test_they_are_kept_in_the_file_and_say_the_same(bent: InteractionModel, tmp_path: Path) -> None:
@@ -223,6 +237,20 @@ def test_widths_are_those_that_hold_the_error() -> None:
     assert float(width[0, 0, 1]) == pytest.approx(0.5, rel=0.1)
     assert float(width[0, 0, [0, 2]].sum()) < 0.05
     assert float((error.abs() <= 1.96 * left_out).double().mean()) == pytest.approx(0.95, abs=0.015)
+
+
+def test_widths_are_stretched_by_how_little_is_known() -> None:
+    """Each level by its own errors; one that was hardly seen not less than the one below, nor less than 1."""
+    draws = np.random.default_rng(0)
+    levels = np.eye(3)[draws.integers(0, 2, (400, 2, 1, 2))]  # the last is never seen
+    miss = np.abs(draws.standard_normal((400, 2, 1, 2))) * (levels @ np.array([0.5, 2.0, 9.0]))
+    place, fold = torch.ones(400, 2, 1, 1).double(), torch.arange(400) % 5
+    whole, each = stretching(torch.tensor(miss), place, torch.tensor(levels), fold)
+    np.testing.assert_allclose(whole[0], [0.5, 2.0, 2.0], rtol=0.1)
+    np.testing.assert_allclose(each, np.broadcast_to(whole, each.shape), rtol=0.1)
+    known = torch.tensor(np.eye(3)[np.zeros_like(miss, dtype=int)])
+    sure, _ = stretching(torch.tensor(0.5 * miss), place, known, fold)
+    assert sure[0, 1:].tolist() == [1.0, 1.0]
 
 
 def test_what_was_seen_of_late_is_of_all_samples() -> None:

@@ -89,7 +89,7 @@ class Expert(nn.Module):
 
     Args:
         path: of a single demonstration, the mean.
-        pace: [], 1/s, the mean phase velocity.
+        pace: 1/s, the mean phase velocity.
         seen: int64 [k], DoFs that it reads.
         said: int64 [T], DoFs that it speaks of; of others it says what the mean does.
         seconds: [K] increasing, its horizons; infinity, the last, is the end.
@@ -124,7 +124,7 @@ class Expert(nn.Module):
     def __init__(
         self,
         path: DemonstrationTable,
-        pace: Tensor,
+        pace: float,
         seen: Tensor,
         said: Tensor,
         seconds: Sequence[float] = SECONDS,
@@ -144,7 +144,7 @@ class Expert(nn.Module):
         new, k, K, T = path.cells.new_zeros, len(seen), len(places), len(said)
         self.path, self.windows = path, tuple(as_number("window", window, 0, above=True) for window in windows)
         self.hidden, self.networks = as_count("hidden", hidden), as_count("networks", networks)
-        self.register_buffer("pace", owned(pace))
+        self.register_buffer("pace", new(()) + as_number("pace", pace))
         self.register_buffer("seen", owned(seen), persistent=False)
         self.register_buffer("said", owned(said), persistent=False)
         self.register_buffer("middle", new(k))
@@ -189,7 +189,7 @@ class Expert(nn.Module):
         mean = DemonstrationTable(table.values.mean(0, keepdim=True), table.slopes.mean(0, keepdim=True))
         masks = (as_mask(name, mask, table.n_dofs) for name, mask in (("seen", seen), ("said", said)))
         reads, says = (mask.nonzero().squeeze(-1).to(primitive.weights.device) for mask in masks)
-        return cls(mean, primitive.phase_velocity.mean(), reads, says, seconds, windows, hidden, networks)
+        return cls(mean, primitive.phase_velocity.mean().item(), reads, says, seconds, windows, hidden, networks)
 
     @property
     def layers(self) -> Layers:
