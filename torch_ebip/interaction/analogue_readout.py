@@ -155,29 +155,26 @@ class AnalogueReadout(nn.Module):
         theirs, spread = self.analogues.forecast(self.analogues(present), lead)
         at = horizon_hats(lead, self.seconds)  # [..., P, K]
         widths, apart = widths_of(forecast, variance), forecast.mean - theirs
-        level = level_hats(widths, self.levels) if len(self.levels) > 1 else None  # [..., P, D, J]
-        if level is not None:
-            apart = (apart.unsqueeze(-2) * level.transpose(-1, -2)).flatten(-2)
-        both = torch.cat([apart, theirs - mean], -1)
+        level = level_hats(widths, self.levels)  # [..., P, D, J]
+        followed = (apart.unsqueeze(-2) * level.transpose(-1, -2)).flatten(-2)
+        both = torch.cat([followed, theirs - mean], -1)
         D = self.width.shape[1]
         every = (both @ torch.cat([self.follow, self.correct], -1).flatten(0, 1).T).view(*at.shape, D)
         stacked = theirs + (at.unsqueeze(-2) @ every).squeeze(-2)
-        if self.expert is not None and self.heed is not None:
-            share = (
-                self._weighed(self.heed, at, level)
-                * self.expert.believed(self.expert.before(present))[..., None, None]
-            )
+        # Of all that is linear between horizons, one product: a forecast is a matter of how many operations it takes.
+        kept = [self.width, self.surest.unsqueeze(-1), self.stretch] + ([] if self.heed is None else [self.heed])
+        n, J = sum(each.shape[-1] for each in kept), len(self.levels)
+        here = (at @ torch.cat(kept, -1).flatten(1)).view(*at.shape[:-1], D, n)
+        V = len(VOICES)
+        width, surest, stretch = here[..., :V], here[..., V], (here[..., V + 1 : V + 1 + J] * level).sum(-1)
+        if self.expert is not None:
+            share = (here[..., V + 1 + J :] * level).sum(-1)
+            share = share * self.expert.believed(self.expert.before(present))[..., None, None]
             stacked = torch.lerp(stacked, self.expert(present, lead), share)
-        stacked = torch.lerp(stacked, forecast.mean, surer(widths, at @ self.surest))
+        stacked = torch.lerp(stacked, forecast.mean, surer(widths, surest))
         of_each = torch.stack([widths.own, root(spread), widths.demonstrated], -1)
-        deviation = ((at @ self.width.flatten(1)).view_as(of_each) * of_each).sum(-1)
-        deviation = deviation * self._weighed(self.stretch, at, level)
+        deviation = (width * of_each).sum(-1) * stretch
         return moved(forecast, stacked, deviation, torch.ones_like(deviation), widths)
-
-    def _weighed(self, values: Tensor, at: Tensor, level: Tensor | None) -> Tensor:
-        """[..., P, D], of values [K, D, J] by the weights of horizons [..., P, K] and of levels [..., P, D, J]."""
-        found = (at @ values.flatten(1)).view(*at.shape[:-1], *values.shape[1:])
-        return (found if level is None else found * level).sum(-1)
 
     def together(self, dofs: Tensor) -> Tensor:
         """Those that must be forecast for some DoFs, bool [D], to be: what they are corrected by is among them."""
