@@ -274,14 +274,14 @@ def test_foreign_cut_off_and_later_files_are_named(tmp_path: Path) -> None:
     flipped = bytearray(content)
     flipped[-100] ^= 1
     (tmp_path / "flipped").write_bytes(bytes(flipped))
-    (tmp_path / "later").write_bytes(content.replace(b'"version":"5"', b'"version":"7"'))
+    (tmp_path / "later").write_bytes(content.replace(b'"version":"6"', b'"version":"7"'))
     messages = {
         "foreign": "tensors of something else",
         "cut": "cut off or damaged",
         "head": "cut off in its header",
         "pickle": "not a model",
         "flipped": "damaged model",
-        "later": "model format '7', this torch_ebip reads up to 5",
+        "later": "model format '7', this torch_ebip reads up to 6",
     }
     for name, message in messages.items():
         with pytest.raises(ValueError, match=f"{name}: .*{message}"):
@@ -309,4 +309,4 @@ def test_a_description_of_something_else_is_refused_though_its_sum_is_right(tmp_
         write_model_file(path, {**description, key: value}, tensors)
         with pytest.raises(ValueError, match="m: a model whose parts do not fit together"):
             load_model(path)
-    assert (KIND, VERSION) == ("torch_ebip model", 5)
+    assert (KIND, VERSION) == ("torch_ebip model", 6)
