@@ -59,6 +59,18 @@ def bent() -> InteractionModel:
     return learn(bending(60), **QUICK)
 
 
+def the_file_says_the_same(model: InteractionModel, y: torch.Tensor, folder: Path) -> None:
+    """Of a recording at horizons and between them; and a session of it forecasts."""
+    model.save(folder / "model.safetensors")
+    again, ahead = InteractionModel.load(folder / "model.safetensors"), [0.1, 0.7, math.inf]
+    for ours, theirs in zip(model.forecast(y, ahead)[:2], again.forecast(y, ahead)[:2], strict=True):
+        torch.testing.assert_close(ours, theirs)
+    session = again.session()
+    for i, row in enumerate(y[:20]):
+        session.push("hand", row[:2].tolist(), i / 30)
+    assert session.forecast().mean.isfinite().all()
+
+
 def error(model: InteractionModel, tests: Demonstrations, share: float = 0.7) -> float:
     """Root mean squared error of the end, after a share of each."""
     misses = []
@@ -82,6 +94,7 @@ def test_they_bend_where_the_filter_cannot(bent: InteractionModel) -> None:
     # What the present tells no expert tells better; then there is none.
     assert not bent.report["expert"]["used"]
     assert bent.filter.readout.expert is None
+    assert "expert" not in bent.report["stages"]  # of which the verdict speaks
     assert len(bent.filter.analysis.recent.windows) == 1
     assert "analogues" not in straight.report
 
@@ -98,6 +111,9 @@ def test_deviations_hold_what_they_say(bent: InteractionModel) -> None:
 
 def test_who_knows_little_is_not_sure(bent: InteractionModel) -> None:
     """At the first sample, and of sensors that fell silent early, the intervals of the end still hold it."""
+    least, targets = bent.filter.readout.surest, bent.layout.controlled
+    assert (least[:, targets] > 0).all()
+    assert (least[:, ~targets] == 0).all()
     first, silent = [], []
     for trajectory in bending(60, seed=6):
         end, shown = trajectory[-1, -1], trajectory.clone()
@@ -110,17 +126,7 @@ def test_who_knows_little_is_not_sure(bent: InteractionModel) -> None:
 
 
 def test_they_are_kept_in_the_file_and_say_the_same(bent: InteractionModel, tmp_path: Path) -> None:
-    bent.save(tmp_path / "model.safetensors")
-    again = InteractionModel.load(tmp_path / "model.safetensors")
-    y = bending(1, seed=3)[0]
-    for ours, theirs in zip(
-        bent.forecast(y, [0.1, math.inf])[:2], again.forecast(y, [0.1, math.inf])[:2], strict=True
-    ):
-        torch.testing.assert_close(ours, theirs)
-    session = again.session()
-    for i, row in enumerate(y[:20]):
-        session.push("hand", row[:2].tolist(), i / 30)
-    assert session.forecast().mean.isfinite().all()
+    the_file_says_the_same(bent, bending(1, seed=3)[0], tmp_path)
 
 
 def test_a_model_that_grows_compares_with_the_new_ones_too(bent: InteractionModel) -> None:

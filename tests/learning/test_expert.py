@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.learning.test_analogues import the_file_says_the_same
 from torch_ebip import (
     Demonstrations,
     ForecastObjective,
@@ -54,17 +55,7 @@ def test_it_is_heard_where_the_past_tells_more(told_before: InteractionModel, tm
     assert report["stages"]["expert"]["error"] < 0.97 * report["stages"]["analogues"]["error"]
     assert isinstance(readout.expert, Expert)
     assert told_before.filter.analysis.recent.windows == readout.expert.windows
-    told_before.save(tmp_path / "model.safetensors")
-    again = InteractionModel.load(tmp_path / "model.safetensors")
-    y = gestures(1, seed=3)[0]
-    for ours, theirs in zip(
-        told_before.forecast(y, [0.1, 0.7, math.inf])[:2], again.forecast(y, [0.1, 0.7, math.inf])[:2], strict=True
-    ):
-        torch.testing.assert_close(ours, theirs)
-    session = again.session()
-    for i, row in enumerate(y[:20]):
-        session.push("hand", row[:2].tolist(), i / 30)
-    assert session.forecast().mean.isfinite().all()
+    the_file_says_the_same(told_before, gestures(1, seed=3)[0], tmp_path)
 
 
 def test_a_model_that_grows_keeps_it(told_before: InteractionModel) -> None:

@@ -33,7 +33,7 @@ class Memory(NamedTuple):
         origin: int64 [..., E], as which of the prior's states each member started; None where the prior does not
         know.
         surprise: a NamedTuple of tensors with ``level`` and ``counts`` [..., S]; None where nobody asks.
-        recent: sums [..., 5, D] over what was seen of late, see `Recent`; None where nobody asks.
+        recent: sums [..., 5 W, D] over what was seen of late, see `Recent`; None where nobody asks.
     """
 
     weighting: Any = None

@@ -39,7 +39,7 @@ class ReadOut(NamedTuple):
 
     Attributes:
         drawn: the read-out that the filter now has, and what it comes to.
-        scores: of each that was tried, by stage: ``shrinkage``, ``analogues`` and ``expert``.
+        scores: by stage: ``shrinkage``, ``analogues`` if they were tried, ``expert`` if one is heard.
         said: what the report says of them.
         remarks: what was not tried, and why.
     """
@@ -108,11 +108,10 @@ def learn_readout(
             heeded = learn_heed(held_out, experts, said, corrections.drawn)
             pays = bool((heeded.heed > 0).any())
             with_it = put_together(held_out, head, corrections, said, scored, network, heeded) if pays else stacked
-            scores["expert"] = with_it.scores
             heard = with_it.scores["crps"] < (1 - PAYS) * stacked.scores["crps"]
             told["expert"] = _told(heard, with_it, stacked, heeded.shares)
             if heard:
-                stacked = with_it
+                scores["expert"], stacked = with_it.scores, with_it
             else:
                 filter.analysis.recent = recent_of(task.primitive)
         used = not choose or stacked.scores["crps"] < drawn.scores["crps"]
