@@ -358,7 +358,7 @@ def test_time_goes_on_between_and_after_samples() -> None:
 
 def test_several_threads_may_push() -> None:
     stream = samples()
-    # A thread may be held up for as long as the machine likes: no sample of the stream may be too late for the window.
+    # A thread may be held up for as long as the machine likes: no sample may be too late for the window.
     ordered, threaded = live(window=1.0), live(window=1.0)
     for sensor, value, time in stream:
         ordered.push(sensor, value, time)
