@@ -9,6 +9,7 @@ import torch
 
 from tests.conftest import interactions, small_primitive
 from torch_ebip import (
+    AcceleratingPhase,
     BSplineBasis,
     Demonstrations,
     DriftingPhase,
@@ -36,6 +37,7 @@ OPTIONS = {
     "tuned": {"square_root": True, "weigh": True, "inflation": 1.01, "context": BSplineBasis(4), "sharpness": 7.0},
     "robust": {"robust": StudentT(3.0), "weight_noise": 0.1},
     "drifting": {"phase": DriftingPhase(0.7, overrun=0.1), "localise": True},
+    "accelerating": {"phase": AcceleratingPhase(overrun=0.1), "square_root": True},
     "few": {"n_members": 9},
 }
 

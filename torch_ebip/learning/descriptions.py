@@ -30,6 +30,7 @@ from torch_ebip.interaction.filter_kinds import InteractionEnsembleFilter
 from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.gated_noise import PhaseGatedNoise
 from torch_ebip.interaction.noise import InteractionNoise
+from torch_ebip.interaction.phases.accelerating import AcceleratingPhase
 from torch_ebip.interaction.phases.constant_velocity import ConstantVelocityPhase
 from torch_ebip.interaction.phases.drifting import DriftingPhase
 from torch_ebip.interaction.phases.phase import PhaseModel
@@ -237,7 +238,7 @@ def fill(filter: nn.Module, tensors: Mapping[str, Tensor]) -> None:
 
 def _describe_phase(phase: PhaseModel) -> Description:
     family = type(phase)
-    if family not in (ConstantVelocityPhase, DriftingPhase):
+    if family not in (AcceleratingPhase, ConstantVelocityPhase, DriftingPhase):
         raise TypeError(f"a model file keeps the phases of the library, not {family.__name__}")
     return {"family": family.__name__, "overrun": phase.overrun}
 
@@ -245,6 +246,8 @@ def _describe_phase(phase: PhaseModel) -> Description:
 def _phase_of(description: Description) -> PhaseModel:
     if description["family"] == "ConstantVelocityPhase":
         return ConstantVelocityPhase(description["overrun"])
+    if description["family"] == "AcceleratingPhase":
+        return AcceleratingPhase(description["overrun"])
     if description["family"] == "DriftingPhase":
         return DriftingPhase(1.0, description["overrun"])
     raise ValueError(f"no phase {description['family']!r}")

@@ -47,6 +47,7 @@ class ConstantVelocityPhase(PhaseModel):
         spread = torch.maximum(velocity.std(), 0.01 * velocity.mean())
         return PhaseNoise(0.1 * spread * (primitive.rate * velocity.mean()).sqrt())
 
-    def gradient(self, dt: Tensor) -> Tensor:
-        """See `PhaseModel.gradient`: (1, dt), [..., 2], for dt [...]: the paper's first row of G."""
-        return torch.stack([torch.ones_like(dt), dt], dim=-1)
+    def transition(self, dt: Tensor) -> Tensor:
+        """See `PhaseModel.transition`: the paper's G, [..., 2, 2], for dt [...]."""
+        one = torch.ones_like(dt)
+        return torch.stack([torch.stack([one, dt], -1), torch.stack([torch.zeros_like(dt), one], -1)], -2)

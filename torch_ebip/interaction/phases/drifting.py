@@ -75,6 +75,6 @@ class DriftingPhase(PhaseModel):
         spread = torch.maximum(velocity.std(), 0.01 * velocity.mean())
         return PhaseWalk(spread / velocity.mean().sqrt())
 
-    def gradient(self, dt: Tensor) -> Tensor:
-        """See `PhaseModel.gradient`: 1, [..., 1], for dt [...]."""
-        return torch.ones_like(dt).unsqueeze(-1)
+    def transition(self, dt: Tensor) -> Tensor:
+        """See `PhaseModel.transition`: 1, [..., 1, 1], for dt [...]."""
+        return torch.ones_like(dt)[..., None, None]

@@ -67,14 +67,14 @@ class PhaseModel(FastTwins, nn.Module, ABC):
         moved[..., 0] = self.hold(members[..., 0] + self.velocity(members[..., : self.moving]) * dt[..., None])
         return moved
 
-    def advancer(self, moving: Tensor) -> Callable[[float], None]:
+    def advancer(self, moving: Tensor) -> Callable[[float | Tensor], None]:
         """The same in place for members that are columns.
 
         Args:
             moving: [..., m, E], what moves of them; others hold it, too.
 
         Returns:
-            A function of dt in seconds.
+            A function of dt in seconds, one number or [...].
         """
         return _Advance(self, moving)
 
@@ -86,30 +86,35 @@ class PhaseModel(FastTwins, nn.Module, ABC):
 
     def slope(self, mean: Tensor, dt: Tensor) -> Tensor:
         """Derivative [...] of the phase in dt [...] seconds by that of the mean [..., n]: 1 within the interval."""
-        phase = mean[..., 0] + self.velocity(mean[..., : self.moving]) * dt
+        return self.held_slope(mean[..., 0] + self.velocity(mean[..., : self.moving]) * dt)
+
+    def held_slope(self, phase: Tensor) -> Tensor:
+        """Derivative [...] of `hold` at a phase [...]: 1 within the interval."""
         excess = (phase - phase.clamp(0, 1)).abs()
         return (1 + excess / self.overrun).pow(-2)
 
     @abstractmethod
-    def gradient(self, dt: Tensor) -> Tensor:
-        """Derivative of the phase after dt [...] seconds by what moves before, [..., m], within the interval."""
+    def transition(self, dt: Tensor) -> Tensor:
+        """G of what moves, [..., m, m], within the interval: what is after dt [...] seconds by what was before."""
 
     def moved_covariance(self, mean: Tensor, covariance: Tensor, dt: Tensor) -> Tensor:
-        """G Sigma G', [..., n, n], in O(n): G differs from the identity in its first row only.
+        """G Sigma G', [..., n, n], in O(n): G differs from the identity in its leading rows only.
 
         Args:
             mean: [..., n].
             covariance: Sigma, [..., n, n].
             dt: [...], seconds.
         """
-        gradient = self.slope(mean, dt).unsqueeze(-1) * self.gradient(dt)
-        row = (gradient.unsqueeze(-2) @ covariance[..., : self.moving, :]).squeeze(-2)
-        corner = (gradient * row[..., : self.moving]).sum(-1, keepdim=True)
-        row = torch.cat([corner, row[..., 1:]], dim=-1)
+        m, G = self.moving, self.transition(dt)
+        slope = self.slope(mean, dt).unsqueeze(-1)
+        held = torch.cat([slope, torch.ones_like(slope).expand(*slope.shape[:-1], m - 1)], -1).unsqueeze(-1) * G
+        rows = held @ covariance[..., :m, :]
+        corner = rows[..., :m] @ held.transpose(-1, -2)
         # What rounding made asymmetric does not pile up.
         moved = torch.lerp(covariance, covariance.transpose(-1, -2), 0.5)
-        moved[..., 0, :] = row
-        moved[..., :, 0] = row
+        moved[..., :m, m:] = rows[..., m:]
+        moved[..., m:, :m] = rows[..., m:].transpose(-1, -2)
+        moved[..., :m, :m] = torch.lerp(corner, corner.transpose(-1, -2), 0.5)
         return moved
 
     def select(self, view: View) -> PhaseModel:
@@ -130,10 +135,14 @@ class _Advance:
         view = velocity._is_view() and velocity._base is self._by_member._base
         self._velocity = velocity if view else None  # a view changes with its base
 
-    def __call__(self, dt: float) -> None:
-        """Advance by dt seconds."""
+    def __call__(self, dt: float | Tensor) -> None:
+        """Advance by dt seconds, one number or [...]."""
         phase, velocity = self._phase, self._velocity
-        phase.add_(self._model.velocity(self._by_member) if velocity is None else velocity, alpha=dt)
+        velocity = self._model.velocity(self._by_member) if velocity is None else velocity
+        if isinstance(dt, Tensor):
+            phase.addcmul_(velocity, dt.unsqueeze(-1))
+        else:
+            phase.add_(velocity, alpha=dt)
         low, high = torch.aminmax(phase)
         if float(low) < 0 or float(high) > 1:
             phase.copy_(self._model.hold(phase))
