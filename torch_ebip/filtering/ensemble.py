@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from torch_ebip.common.draws import Generators, is_several, standard_normal
 from torch_ebip.filtering import functional
-from torch_ebip.filtering.carriers.dense import DenseCarrier
+from torch_ebip.filtering.carriers.dense import DenseCarrier, placed
 from torch_ebip.filtering.carriers.serving import why_not_span
 from torch_ebip.filtering.centring import taken_out
 from torch_ebip.filtering.in_place import filter_in_place
@@ -62,7 +62,7 @@ class EnsembleFilter(MemberFilter):
 
     def _predict(self, state: EnsembleState, dt: Tensor, generator: Generators) -> EnsembleState:
         """Step 2: x = g(x) + N(0, Q)."""
-        memory = self.analysis.forget(self.analysis.complete(state.memory, state.deviations), dt)
+        memory, dt = self.analysis.elapse(self.analysis.complete(state.memory, state.deviations), dt)
         return EnsembleState(self.model.advance(state.deviations, dt, generator), memory, state.centre)
 
     def _update(
@@ -76,6 +76,8 @@ class EnsembleFilter(MemberFilter):
             draws = standard_normal((*state.deviations.shape[:-1], self.n_dofs), state.deviations, generator)
         if not bool(observed.any()):
             return state, state.deviations.new_zeros(observed.shape[:-1])
+        if self.analysis.pace is not None:
+            state = placed(self.analysis.pace, self.model, state, y, observed, self.first)
         carrier = DenseCarrier(self.model, state, y, observed)
         if draws is not None and carrier.rows is not None:
             draws = draws[..., carrier.rows]
@@ -86,6 +88,14 @@ class EnsembleFilter(MemberFilter):
         except functional.FactorisationError as error:
             raise self.model.named(error, carrier.rows) from error
         return carrier.state, likelihood
+
+    def first(self, state: EnsembleState) -> Tensor | None:
+        """How the members of a state started, as deviations [..., E, n] from its centre; None if nobody knows."""
+        origin = state.memory.origin
+        if origin is None or not isinstance(self.prior, NumbersItsStates):
+            return None
+        members, _ = self.prior.start(state.deviations.shape[:-2], origin.shape[-1], origin, None)
+        return members if state.centre is None else members - state.centre.unsqueeze(-2)
 
     def _centre(self, state: EnsembleState) -> Tensor | None:
         """See `MemberFilter._centre`."""
@@ -129,7 +139,10 @@ class EnsembleFilter(MemberFilter):
         if reason is not None:
             return reason
         seconds = self.dt if dt is None else float(dt)
-        done = filter_in_place(self.model, self.analysis, y, observed, seconds, state, generator, keep, project)
+        first = None if self.analysis.pace is None else self.first(state)
+        done = filter_in_place(
+            self.model, self.analysis, y, observed, seconds, state, generator, keep, project, first
+        )
         return self._traced(done, "span")
 
     def _traced(self, done: Filtered, engine: str) -> Trace:

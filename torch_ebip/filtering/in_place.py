@@ -23,6 +23,7 @@ def filter_in_place(
     generator: Generators,
     keep: Tensor | None,
     project: bool,
+    first: Tensor | None = None,
 ) -> Filtered:
     """`Filter.forward` for sequences y [T, D] or [B, T, D] that were checked; the same numbers up to rounding.
 
@@ -35,6 +36,7 @@ def filter_in_place(
         generator: of all draws.
         keep: int64 [..., K], after which samples to keep the state.
         project: whether to project.
+        first: see `SpanCarrier`.
 
     Returns:
         See `Filtered`: states [..., T, m], log-likelihood [..., T], projection [..., T, D].
@@ -44,7 +46,7 @@ def filter_in_place(
     everything = (True,) * D
     # The projection is one of all DoFs; otherwise what is never measured can stay behind the transform.
     sensors = torch.ones_like(ever) if project or not bool(ever.any()) else ever
-    carrier = SpanCarrier(model, update, sensors, state, generator)
+    carrier = SpanCarrier(model, update, sensors, state, generator, first)
     some = observed.reshape(-1, length, D).any(0)
     ragged = (observed != some).any(-1).reshape(-1, length).any(0).tolist()
     states, likelihoods, projections, felt = [], [], [], []

@@ -34,6 +34,7 @@ class Memory(NamedTuple):
         know.
         surprise: a NamedTuple of tensors with ``level`` and ``counts`` [..., S]; None where nobody asks.
         recent: sums [..., 5 W, D] over what was seen of late, see `Recent`; None where nobody asks.
+        pace: a NamedTuple of tensors, what a `Pace` remembers; None where there is none.
     """
 
     weighting: Any = None
@@ -41,6 +42,7 @@ class Memory(NamedTuple):
     origin: Tensor | None = None
     surprise: Any = None
     recent: Tensor | None = None
+    pace: Any = None
 
     def __repr__(self) -> str:
         return brief(self)

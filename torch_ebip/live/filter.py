@@ -99,7 +99,8 @@ class LiveFilter:
         if state is None:
             state = filter.initial_state(batch_shape, demonstrations, generator, members=members)
         self.filter, self.generator, self.batch_shape = filter, generator, batch_shape
-        self.carrier = SpanCarrier(filter.model, filter.analysis, dofs, state, generator)
+        first = None if filter.analysis.pace is None else filter.first(state)
+        self.carrier = SpanCarrier(filter.model, filter.analysis, dofs, state, generator, first)
         self._like, self._dt, self._n_dofs = self.carrier.matrix, filter.dt, filter.n_dofs
         self._forecasters: OrderedDict[tuple[bool, ...], tuple[InteractionEnsembleFilter, Tensor, Tensor | None]] = (
             OrderedDict()

@@ -19,19 +19,21 @@ class ColumnMembers:
         seen: int64 [k], ascending, the entries that stand still and that measurements depend on, counted from the
             first that stands still.
         moving: m, how many leading entries move.
+        first: as they started, [..., E, n], of members that have come some way; default: that is now.
 
     Attributes:
         matrix: [..., m + k + min(E, rest), E]; to be changed in place, and never replaced: others hold views of it.
     """
 
-    def __init__(self, start: Tensor, seen: Tensor, moving: int) -> None:
+    def __init__(self, start: Tensor, seen: Tensor, moving: int, first: Tensor | None = None) -> None:
         E, n = start.shape[-2:]
         self._moving = moving
         hidden = torch.ones(n - moving, dtype=torch.bool, device=start.device)
         hidden[seen] = False
         rest = hidden.nonzero().squeeze(-1)
         self._start, self._seen_count = start, len(seen)
-        self._transformed = len(rest) > E
+        # A transform of where they are now leads to where they started only if that is the same.
+        self._transformed = len(rest) > E and (first is None or torch.equal(start[..., moving:], first[..., moving:]))
         # Where each weight is in the matrix; those behind the transform are counted from the end of the seen ones.
         self._place = torch.empty(n - moving, dtype=torch.long, device=start.device)
         self._place[seen] = torch.arange(len(seen), device=start.device)
@@ -39,8 +41,11 @@ class ColumnMembers:
         last = start[..., moving + rest]
         if self._transformed:
             last = torch.eye(E, dtype=start.dtype, device=start.device).expand(*start.shape[:-2], E, E)
-        first = start[..., torch.cat([torch.arange(moving, device=start.device), moving + seen])]
-        self.matrix = torch.cat([first, last], dim=-1).transpose(-1, -2).contiguous()
+        leading = start[..., torch.cat([torch.arange(moving, device=start.device), moving + seen])]
+        self.matrix = torch.cat([leading, last], dim=-1).transpose(-1, -2).contiguous()
+        self._still: Tensor | None = None
+        self._from = start if first is None else first
+        self._order = torch.cat([seen, rest])
 
     @property
     def moving(self) -> Tensor:
@@ -50,6 +55,19 @@ class ColumnMembers:
     def seen(self, part: slice) -> Tensor:
         """A slice of what stands still and sensors see, [..., k, E]: a view."""
         return self.matrix[..., self._moving + part.start : self._moving + part.stop, :]
+
+    def renew(self, share: Tensor) -> None:
+        """Of what stands still a share [...] becomes what it was at first."""
+        m, still = self._moving, self._still
+        if still is None:
+            k = self._seen_count
+            still = self._from[..., m + self._order].transpose(-1, -2)
+            if self._transformed:
+                still = torch.cat(
+                    [still[..., :k, :], torch.eye(still.shape[-1]).to(still).expand(*still.shape[:-2], -1, -1)], -2
+                )
+            self._still = still = still.contiguous()
+        self.matrix[..., m:, :].lerp_(still, share[..., None, None])
 
     def members(self, columns: Tensor, entry: int | None = None) -> Tensor:
         """What moves and some of what stands still, int64 [k], up to date: [..., E, m + k], a copy.

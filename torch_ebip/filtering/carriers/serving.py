@@ -35,7 +35,7 @@ class ProjectsColumns(Protocol):
 class AdvancesColumns(Protocol):
     """Dynamics that advance what moves in place."""
 
-    def advancer(self, moving: Tensor) -> Callable[[float], None]:
+    def advancer(self, moving: Tensor) -> Callable[[float | Tensor], None]:
         """What advances members that are columns, [..., m, E], by so many seconds whenever it is called."""
 
 

@@ -34,8 +34,10 @@ from torch_ebip.filtering.functional.moments import member_shares
 from torch_ebip.filtering.functional.update import Spread
 from torch_ebip.filtering.model import StateSpace
 from torch_ebip.filtering.states import EnsembleState, Memory, map_state
+from torch_ebip.filtering.updates.pace import led
 from torch_ebip.filtering.updates.rules import Columns, Rule
 from torch_ebip.filtering.updates.update import Update, analyse
+from torch_ebip.filtering.updates.weighting import Seen
 
 
 class SpanCarrier(Carrier):
@@ -46,13 +48,21 @@ class SpanCarrier(Carrier):
         sensors: bool [D], the DoFs that may be measured. The fewer, the faster.
         state: where to start.
         generator: of all draws.
+        first: how members started, as deviations [..., E, n] from the state's centre, for a `Pace`; None where nobody
+            knows.
 
     Raises:
         ValueError: a model or an update that it cannot serve: says why.
     """
 
     def __init__(
-        self, model: StateSpace, update: Update, sensors: Tensor, state: EnsembleState, generator: Generators
+        self,
+        model: StateSpace,
+        update: Update,
+        sensors: Tensor,
+        state: EnsembleState,
+        generator: Generators,
+        first: Tensor | None = None,
     ) -> None:
         reason = why_not_span(model, update)
         if reason is not None:
@@ -77,7 +87,8 @@ class SpanCarrier(Carrier):
         self.memory = update.complete(state.memory, start)
         self.batch_shape, m = tuple(start.shape[:-2]), part.moving
         seen = view.state[m:] - m
-        self._columns = ColumnMembers(start, seen, m)
+        self._columns = ColumnMembers(start, seen, m, first)
+        self._renews = first is not None
         self._middle = state.centre[..., view.state[m:]]
         self.matrix, self._moving = self._columns.matrix, self._columns.moving
         self._advance = part.dynamics.advancer(self._moving)
@@ -144,12 +155,18 @@ class SpanCarrier(Carrier):
             factor = self._process.factor(seconds)
             self._step_factor = dt, factor.expand(*self.batch_shape, *factor.shape[-2:]), seconds
         self._mean = None
-        self._advance(dt)
-        self._drawn(self._draws)
-        self._add_product(self._moving, self._step_factor[1], self._draws_by_entry)
+        _, factor, seconds = self._step_factor
         memory = self.memory
-        if memory.weighting is not None or memory.surprise is not None or memory.recent is not None:
-            self.memory = self._update.forget(self.memory, self._step_factor[2])
+        if memory.pace is not None:
+            self.memory, gone = self._update.elapse(memory, seconds)
+            self._advance(gone)
+            factor = self._process.factor(gone)
+        else:
+            self._advance(dt)
+            if memory.weighting is not None or memory.surprise is not None or memory.recent is not None:
+                self.memory = self._update.forget(memory, seconds)
+        self._drawn(self._draws)
+        self._add_product(self._moving, factor, self._draws_by_entry)
 
     def take(self, y: Tensor, measured: tuple[bool, ...], mask: Tensor | None) -> Tensor:
         """Take in one sample that was checked.
@@ -177,6 +194,7 @@ class SpanCarrier(Carrier):
             torch.index_select(draws, -1, plan.dofs, out=plan.draws)
         elif perturbs:
             self._drawn(plan.draws)
+        self._place(plan, y, mask)
         sample = self._measure(plan, y, mask)
         return analyse(self._slots, self, sample, plan.draws_by_dof if perturbs else None)
 
@@ -251,6 +269,22 @@ class SpanCarrier(Carrier):
         observed = None if seen is None else seen.squeeze(-1)
         self._measured = Measured(plan.values, observed, deviations, plan.rows)
         return self._measured
+
+    def _place(self, plan: Plan, y: Tensor, mask: Tensor | None) -> None:
+        """Lead the members where the pace has them, now that a sample was seen."""
+        pace, memory = self._slots.pace, self.memory
+        if pace is None or memory.pace is None:
+            return
+        observed = None if mask is None else mask.index_select(-1, plan.dofs)
+        moving, mean = self.moving, self.mean
+        seen = Seen(y.index_select(-1, plan.dofs), observed, None, plan.rows, moving, mean, memory.origin)
+        remembered, placement = pace.notice(memory.pace, seen)
+        self.memory = memory._replace(pace=remembered)
+        if placement is not None:
+            self._moving.copy_(led(moving, mean, placement).transpose(-1, -2))
+            self._mean = None
+            if self._renews and bool((placement.renewed > 0).any()):
+                self._columns.renew(placement.renewed)
 
     def _believed(self, plan: Plan) -> tuple[Tensor, Tensor, Tensor]:
         """R of a plan's DoFs, kept while no parameter changes, unless it depends on the state."""

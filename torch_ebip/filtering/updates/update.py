@@ -14,6 +14,7 @@ from torch_ebip.filtering.protocols import View
 from torch_ebip.filtering.states import Memory
 from torch_ebip.filtering.updates.inflation import SpreadRule
 from torch_ebip.filtering.updates.localisation import Localisation
+from torch_ebip.filtering.updates.pace import Pace
 from torch_ebip.filtering.updates.part import Part
 from torch_ebip.filtering.updates.recent import Recent
 from torch_ebip.filtering.updates.rules import Rule, Stochastic
@@ -38,6 +39,7 @@ class Slots(NamedTuple):
     localisation: Localisation | None
     inflation: SpreadRule | None
     recent: Recent | None = None
+    pace: Pace | None = None
 
 
 class Update(nn.Module):
@@ -51,6 +53,7 @@ class Update(nn.Module):
         localisation: factors on the cross-covariances of blocks of the state.
         inflation: what becomes of the anomalies: `Inflation`.
         recent: remembers what was seen of late, for forecasts that compare it: `Recent`.
+        pace: holds the clock of the model, and leads members back that are lost, before anything else: `PhaseBank`.
 
     Example:
         >>> from torch_ebip import Inflation, SquareRoot, StudentT, Update
@@ -63,6 +66,7 @@ class Update(nn.Module):
     localisation: Localisation | None
     inflation: SpreadRule | None
     recent: Recent | None
+    pace: Pace | None
 
     def __init__(
         self,
@@ -73,6 +77,7 @@ class Update(nn.Module):
         inflation: SpreadRule | None = None,
         surprise: Surprise | None = None,
         recent: Recent | None = None,
+        pace: Pace | None = None,
     ) -> None:
         super().__init__()
         self.rule = Stochastic() if rule is None else rule
@@ -82,6 +87,7 @@ class Update(nn.Module):
         self.localisation = localisation
         self.inflation = inflation
         self.recent = recent
+        self.pace = pace
 
     @property
     def parts(self) -> list[Part]:
@@ -94,6 +100,7 @@ class Update(nn.Module):
             self.localisation,
             self.inflation,
             self.recent,
+            self.pace,
         )
         return [part for part in parts if isinstance(part, Part)]
 
@@ -113,7 +120,8 @@ class Update(nn.Module):
         inflation = None if self.inflation is None else self.inflation.start(members)
         surprise = None if self.surprise is None else self.surprise.start(members)
         recent = None if self.recent is None else self.recent.start(members)
-        return Memory(weighting, inflation, origin, surprise, recent)
+        pace = None if self.pace is None else self.pace.start(members, origin)
+        return Memory(weighting, inflation, origin, surprise, recent, pace)
 
     def complete(self, memory: Memory, members: Tensor) -> Memory:
         """The memory of a state made by hand, with members [..., E, n], as if it had seen nothing."""
@@ -123,7 +131,17 @@ class Update(nn.Module):
             memory = memory._replace(surprise=self.surprise.start(members))
         if self.recent is not None and memory.recent is None:
             memory = memory._replace(recent=self.recent.start(members))
+        if self.pace is not None and memory.pace is None:
+            memory = memory._replace(pace=self.pace.start(members, memory.origin))
         return memory
+
+    def elapse(self, memory: Memory, dt: Tensor) -> tuple[Memory, Tensor]:
+        """What is left of a memory after dt [...] seconds, and how many of them the model goes through, [...]."""
+        memory = self.forget(memory, dt)
+        if self.pace is None or memory.pace is None:
+            return memory, dt
+        pace, seconds = self.pace.elapse(memory.pace, dt)
+        return memory._replace(pace=pace), seconds
 
     def forget(self, memory: Memory, dt: Tensor) -> Memory:
         """What is left of a memory after dt [...] seconds."""
@@ -141,7 +159,7 @@ class Update(nn.Module):
         part = sharing(self)
         part.rule = self.rule.select(view)
         part.trust = nn.ModuleList([trust.select(view) for trust in self.trust])  # type: ignore[operator]
-        for name in ("surprise", "weighting", "localisation", "inflation", "recent"):
+        for name in ("surprise", "weighting", "localisation", "inflation", "recent", "pace"):
             slot = getattr(self, name)
             setattr(part, name, None if slot is None else slot.select(view))
         return part
@@ -150,7 +168,9 @@ class Update(nn.Module):
     def slots(self) -> Slots:
         """The parts by their places."""
         trust: tuple[RobustWeights, ...] = tuple(self.trust)  # type: ignore[arg-type]
-        return Slots(self.rule, self.surprise, trust, self.weighting, self.localisation, self.inflation, self.recent)
+        return Slots(
+            self.rule, self.surprise, trust, self.weighting, self.localisation, self.inflation, self.recent, self.pace
+        )
 
 
 def analyse(slots: Slots, carrier: Carrier, measured: Measured, perturbations: Tensor | None) -> Tensor:
@@ -165,7 +185,7 @@ def analyse(slots: Slots, carrier: Carrier, measured: Measured, perturbations: T
     Returns:
         The log-likelihood [...] of what was measured.
     """
-    rule, surprise, trust, weighting, localisation, inflation, recent = slots
+    rule, surprise, trust, weighting, localisation, inflation, recent, pace = slots
     memory, counts, spread, taper = carrier.memory, None, NO_SPREAD, None
     observed = measured.observed
     weights, grown, felt, lately = memory.weighting, memory.inflation, memory.surprise, memory.recent
@@ -175,6 +195,8 @@ def analyse(slots: Slots, carrier: Carrier, measured: Measured, perturbations: T
             felt, counts = surprise.judge(felt, noticed)
             observed = _not_rejected(observed, counts)
         measured, counts = _trusted(surprise, trust, noticed, measured, counts)
+    if pace is not None and memory.pace is not None:
+        measured = _counted(measured, pace.counts(memory.pace))
     if weights is not None or lately is not None:
         seen = Seen(measured.y, observed, counts, measured.rows, carrier.moving, carrier.mean, memory.origin)
         weights = weights if weighting is None or weights is None else weighting.learn(weights, seen)
@@ -184,10 +206,15 @@ def analyse(slots: Slots, carrier: Carrier, measured: Measured, perturbations: T
     if localisation is not None:
         taper = localisation()
     likelihood = carrier.move(rule, measured, taper, spread, perturbations)
-    now = Memory(weights, grown, memory.origin, felt, lately)
+    now = Memory(weights, grown, memory.origin, felt, lately, memory.pace)
     if any(after is not before for after, before in zip(now, memory, strict=True)):
         carrier.memory = now
     return likelihood
+
+
+def _counted(measured: Measured, counts: Tensor) -> Measured:
+    """A sample of which every value counts so much, [...], in (0, 1]."""
+    return measured._replace(deviation=measured.deviation / counts.sqrt().unsqueeze(-1))
 
 
 def _not_rejected(observed: Tensor | None, counts: Tensor | None) -> Tensor | None:
