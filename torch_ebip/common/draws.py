@@ -66,6 +66,13 @@ def seeded(*numbers: int) -> torch.Generator:
     return torch.Generator("cpu").manual_seed(seed >> 32)  # the better half; torch's generator takes no more
 
 
+def fill_standard_normal(buffer: Tensor, generator: Generators) -> Tensor:
+    """The buffer [...], filled with standard-normal draws: those that `standard_normal` would make."""
+    if generator is None or (isinstance(generator, torch.Generator) and generator.device == buffer.device):
+        return buffer.normal_(generator=generator)
+    return buffer.copy_(standard_normal(buffer.shape, buffer, generator))
+
+
 def replayed(generator: Generators, states: Sequence[Tensor] | None = None) -> Generators:
     """New generators that will make the draws that ``generator`` would make now, or made from some states on.
 

@@ -7,7 +7,8 @@ from torch import Tensor, nn
 
 from torch_ebip.common.draws import Generators, is_several, standard_normal
 from torch_ebip.filtering import functional
-from torch_ebip.filtering.carriers.dense import DenseCarrier, placed
+from torch_ebip.filtering.carriers.dense import DenseCarrier
+from torch_ebip.filtering.carriers.placing import placed
 from torch_ebip.filtering.carriers.serving import why_not_span
 from torch_ebip.filtering.centring import taken_out
 from torch_ebip.filtering.in_place import filter_in_place

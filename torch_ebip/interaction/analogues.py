@@ -221,7 +221,8 @@ class Analogues(nn.Module):
             at = lead.phase.unsqueeze(-2).expand(*analogy.phase.shape, -1)
         else:
             end = lead.asked.isinf()
-            gone = torch.where(end, 0, lead.asked) * self.pace.unsqueeze(-1)
+            seconds = lead.asked if lead.gone is None else lead.gone.unsqueeze(-2)
+            gone = torch.where(end, 0, seconds) * self.pace.unsqueeze(-1)
             at = torch.where(end, 1, analogy.phase.unsqueeze(-1) + gone).clamp(0, 1)
         which = torch.arange(N, device=at.device).expand(at.shape[:-1])
         whole = len(self.rows) == self.table.n_dofs

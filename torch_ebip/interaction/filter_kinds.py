@@ -46,9 +46,11 @@ class InteractionMemberFilter(InteractionFilter, MemberFilter):
         m, basis, members = self.phase_model.moving, self.basis_projection.basis, state[0]
         moving = self.model.split(members)[0]
         now, velocity = moving[..., 0].unsqueeze(-2), self.phase_model.velocity(moving).unsqueeze(-2)
-        end = ahead.isinf().unsqueeze(-1)
+        seconds, end = ahead.unsqueeze(-1), ahead.isinf().unsqueeze(-1)
+        if self.pace is not None and (held := self.whereabouts(state)) is not None:
+            seconds = self.pace.gone_apart(held, ahead, members.shape[-2])
         # A member that runs backwards, of a hand that goes back, waits: it has no end to come to.
-        phase = now + velocity.clamp(min=0) * torch.where(end, 0, ahead.unsqueeze(-1))
+        phase = now + velocity.clamp(min=0) * torch.where(end, 0, seconds)
         phase = torch.where(end, 1, phase).clamp(max=1)
         weights = None if state.weights is None else state.weights.unsqueeze(-2)
         mean = functional.ensemble_mean(phase.unsqueeze(-1), weights)

@@ -19,6 +19,7 @@ from torch_ebip.interaction.attribution import affine_coefficients
 from torch_ebip.interaction.bounds import Bounds
 from torch_ebip.interaction.doubt import Doubt
 from torch_ebip.interaction.forecast import Forecast, Phases, as_phases, as_seconds_ahead
+from torch_ebip.interaction.phase_bank import PhaseBank, Whereabouts
 from torch_ebip.interaction.phases.phase import PhaseModel
 from torch_ebip.interaction.present import Present, present_of
 from torch_ebip.interaction.projection import BasisProjection
@@ -128,6 +129,8 @@ class InteractionFilter(Filter):
         if self.readout is None and self.doubt is None and self.bounds is None:
             return forecast
         lead = self.lead(state, forecast.phase, seconds)
+        if seconds is not None and self.pace is not None and (held := self.whereabouts(state)) is not None:
+            lead = lead._replace(gone=self.pace.gone(held, seconds))
         mean, variance = self.demonstrated(lead.phase)
         if self.readout is not None:
             present = self.present(state) if self.readout.reads_present else None
@@ -180,7 +183,12 @@ class InteractionFilter(Filter):
                 "a state made by hand does not remember what was seen of late: `initial_state` makes one that does"
             )
         count = len(self.prior.states)  # type: ignore[arg-type]
-        return present_of(state[0][..., 0], memory, recent, count)
+        found = present_of(state[0][..., 0], memory, recent, count)
+        if self.pace is None or memory.pace is None:
+            return found
+        # Who stands still has a velocity that says nothing of where: no demonstration stood there.
+        going = (1 - self.pace.held(memory.pace)).unsqueeze(-1)
+        return found._replace(line=found.line._replace(moves=found.line.moves * going))
 
     def doubted(self, state: State) -> Tensor:
         """[...], how surprising the interaction of a ``state`` is of late, see `InteractionSurprise.doubt`."""
@@ -200,6 +208,18 @@ class InteractionFilter(Filter):
         """What remembers what was seen of late; None if nothing does."""
         found = getattr(getattr(self, "analysis", None), "recent", None)
         return found if isinstance(found, Recent) else None
+
+    @property
+    def pace(self) -> PhaseBank | None:
+        """What follows the phase beside the members; None if nothing does."""
+        found = getattr(getattr(self, "analysis", None), "pace", None)
+        return found if isinstance(found, PhaseBank) else None
+
+    def whereabouts(self, state: State) -> Whereabouts | None:
+        """What a ``state`` remembers for `pace`; None if nothing."""
+        memory = getattr(state, "memory", None)
+        held: Whereabouts | None = None if memory is None else memory.pace
+        return held
 
     @eager
     def familiarity(self, state: State) -> Tensor:

@@ -46,8 +46,8 @@ class Likeness(nn.Module):
         N, P, k = values.shape
         if velocities.shape != values.shape or error.shape != (2, k) or len(dofs) != k or len(sensor_of_dof) != k:
             raise ValueError(
-                f"values, velocities, error, dofs and sensor_of_dof must be [N, P, k] twice, [2, k] and [k] twice, got "
-                f"{list(values.shape)}, {list(velocities.shape)}, {list(error.shape)}, {len(dofs)}, "
+                "values, velocities, error, dofs and sensor_of_dof must be [N, P, k] twice, [2, k] and [k] twice, "
+                f"got {list(values.shape)}, {list(velocities.shape)}, {list(error.shape)}, {len(dofs)}, "
                 f"{len(sensor_of_dof)}"
             )
         sensors = torch.nn.functional.one_hot(sensor_of_dof).to(values)  # [k, S]
@@ -103,7 +103,7 @@ class Likeness(nn.Module):
         w, v = weight.unbind()
         none = torch.zeros_like(w)
         rows = torch.stack([w, -2 * w * x, none, none, none, none, v, none, none, none, none, v * u], -1)
-        R, k = x.shape
+        R = len(x)
         S, F, NP = self.blocks.shape
         placed = x.new_zeros(R, S * self._widest, 12)
         placed[:, self.place] = rows

@@ -76,9 +76,9 @@ class PhaseBank(Pace):
     - of those that go a share 1 - exp(-stop t) stands still, of those that stand 1 - exp(-go t) goes on;
     - who goes is ahead by r v_j t, v_j the demonstration's phase velocity, r one of `RATES`;
     - a share 1 - exp(-jump t) is anywhere, half of it where an interaction begins;
-    - all are weighed by exp(-1/2 sum_s (value min(d_s, cap) + velocity min(e_s, cap))) over sensors s, where d_s is the
-      mean over DoFs of (x - f_j)^2 / q and e_s that of (u - r f'_j v_j)^2 / q', with the r between the least and the
-      largest of `RATES` that fits best; of who stands that of u^2 / q'. x and u are the value and velocity of late.
+    - all are weighed by exp(-1/2 sum_s (value min(d_s, cap) + velocity min(e_s, cap))) over sensors s, where d_s is
+      the mean over DoFs of (x - f_j)^2 / q and e_s that of (u - r f'_j v_j)^2 / q', with the r between the least and
+      the largest of `RATES` that fits best; of who stands that of u^2 / q'. x, u are values and velocities of late.
 
     q and q' are mean squared distances of a demonstration from the nearest other one, and what noise adds, see
     `Likeness`. A sensor that lies counts ``cap`` at most, for all hypotheses alike.
@@ -164,7 +164,7 @@ class PhaseBank(Pace):
 
     def start(self, members: Tensor, origin: Tensor | None) -> Whereabouts:
         """See `Pace.start`: hypotheses are the demonstrations of the ensemble."""
-        batch, (N, P) = members.shape[:-2], (len(self.which), self.likeness.n_phases)
+        batch, N = members.shape[:-2], len(self.which)
         own = members.new_ones(*batch, N)
         if origin is not None:
             count = 1 + max(int(self.which.max()), int(origin.max()))
@@ -178,7 +178,7 @@ class PhaseBank(Pace):
         return Whereabouts(share, own, sums, none + IDLE, none + torch.inf)
 
     def _first(self, own: Tensor, late: Tensor | float) -> Tensor:
-        """[..., 2, N, P], where an interaction of demonstrations [..., N] begins: at phase 0, or, of some, anywhere."""
+        """[..., 2, N, P], where an interaction of demonstrations [..., N] begins: at phase 0; if late, anywhere."""
         P = self.likeness.n_phases
         anywhere = own.new_full((P,), 1.0) * late / P
         begin = torch.cat([anywhere[:1] + (1 - late), anywhere[1:]])
@@ -187,7 +187,7 @@ class PhaseBank(Pace):
 
     def elapse(self, memory: Whereabouts, dt: Tensor) -> tuple[Whereabouts, Tensor]:
         """See `Pace.elapse`."""
-        going = self._going(memory)
+        going = 1 - self.held(memory)
         step = dt.unsqueeze(-1).unsqueeze(-1)
         older = memory.sums[..., (0, 3), :] * step
         sums = memory.sums.index_add(-2, torch.tensor([1, 4], device=older.device), older)
@@ -200,17 +200,34 @@ class PhaseBank(Pace):
         gone = torch.where(memory.clock.isinf(), 0, memory.clock)
         return usual + (memory.standing - usual) * torch.exp(-(stop + go) * gone)
 
+    def held(self, memory: Whereabouts) -> Tensor:
+        """[...], in [0, 1], how far a person is believed to stand still: the ensemble's clock is held by as much."""
+        return ((self.standing(memory) - HELD[0]) / (HELD[1] - HELD[0])).clamp(0, 1)
+
     def resting(self, memory: Whereabouts) -> Tensor:
-        """[...], s until a person goes on, on the average over both modes."""
-        return self.standing(memory) / self.settings[1]
+        """[...], s until a person goes on."""
+        return self.held(memory) / self.settings[1]
+
+    def gone(self, memory: Whereabouts, seconds: Tensor) -> Tensor:
+        """[..., P], s, how long of so many seconds [P] a person goes, on the average; infinity is infinity."""
+        go, end = self.settings[1], seconds.isinf()
+        finite = torch.where(end, 0, seconds)
+        waiting = finite - (1 - torch.exp(-go * finite)) / go
+        return torch.where(end, seconds, torch.lerp(finite, waiting, self.held(memory).unsqueeze(-1)))
+
+    def gone_apart(self, memory: Whereabouts, seconds: Tensor, count: int) -> Tensor:
+        """[..., P, E], as `gone`, each of E members in a case of its own: it goes, or waits for a time of its own."""
+        held, go = self.held(memory)[..., None, None], self.settings[1]
+        # Evenly spread, and in no order that demonstrations might have.
+        place = (torch.arange(count, device=held.device, dtype=held.dtype) + 0.5) * 0.6180339887498949 % 1
+        waits = place < held
+        part = torch.where(waits, place / torch.where(held > 0, held, 1), 0).clamp(max=1 - 1e-6)
+        rest = torch.where(waits, -torch.log1p(-part) / go, 0)
+        return (seconds.unsqueeze(-1) - rest).clamp(min=0)
 
     def counts(self, memory: Whereabouts) -> Tensor:
         """See `Pace.counts`."""
-        return self._going(memory).clamp(min=LEAST_COUNT)
-
-    def _going(self, memory: Whereabouts) -> Tensor:
-        """[...], in [0, 1], how much of the time the ensemble's clock goes."""
-        return 1 - ((self.standing(memory) - HELD[0]) / (HELD[1] - HELD[0])).clamp(0, 1)
+        return (1 - self.held(memory)).clamp(min=LEAST_COUNT)
 
     def notice(self, memory: Whereabouts, seen: Seen) -> tuple[Whereabouts, Placement | None]:
         """See `Pace.notice`."""

@@ -23,6 +23,7 @@ from torch_ebip.interaction.filter_kinds import (
 )
 from torch_ebip.interaction.mixture import MixturePrior, fit_responsibilities
 from torch_ebip.interaction.model import demonstration_states, interaction_model
+from torch_ebip.interaction.phase_bank import PhaseBank
 from torch_ebip.interaction.phases.phase import PhaseModel
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.interaction.priors import DemonstrationPrior, MomentPrior
@@ -52,6 +53,7 @@ def ebip(
     slope: float | Sequence[float] = 2.0,
     relative: float = 0.0,
     phase: PhaseModel | None = None,
+    pace: PhaseBank | None = None,
 ) -> InteractionEnsembleFilter:
     """The paper's eBIP (Section IV): members are demonstrations, R is the closed form.
 
@@ -75,6 +77,7 @@ def ebip(
         slope: how much more that evidence counts late than early, at the start.
         relative: how far its distances are relative to the spread of the demonstrations there, at the start.
         phase: how the phase moves; default: the paper's `ConstantVelocityPhase`.
+        pace: of the primitive, for people who pause, start late or start over: see `PhaseBank`.
 
     Returns:
         A filter with parameters of its own, in the dtype and on the device of the primitive.
@@ -96,6 +99,7 @@ def ebip(
         weighting,
         _localisation(primitive, model) if localise else None,
         None if inflation is None else Inflation(inflation, MOST_GROWTH),
+        pace=None if pace is None else copy.deepcopy(pace).to(primitive.weights),
     )
     prior = DemonstrationPrior(demonstration_states(primitive, phase))
     filter = InteractionEnsembleFilter(model, prior, len(primitive) if n_members is None else n_members, update)

@@ -27,6 +27,7 @@ class Lead(NamedTuple):
         phase: [..., P], of what is forecast.
         end: [..., P], 0 to 1: how far it is the interaction's end that is asked for, whenever that may be.
         asked: [P], the seconds that were asked for, infinity the end; None where phases were.
+        gone: [..., P], how long of these the interaction goes on the average, s; None: all the time.
     """
 
     ahead: Tensor
@@ -34,6 +35,7 @@ class Lead(NamedTuple):
     phase: Tensor
     end: Tensor
     asked: Tensor | None = None
+    gone: Tensor | None = None
 
     def __repr__(self) -> str:
         return brief(self)

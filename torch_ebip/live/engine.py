@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+import math
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -13,6 +14,37 @@ from torch_ebip.interaction.filter_kinds import InteractionEnsembleFilter
 from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.forecast import Forecast
 from torch_ebip.live.filter import LiveFilter, LiveSnapshot
+
+
+class Waits(NamedTuple):
+    """Whether an interaction goes on.
+
+    Attributes:
+        held: 0 to 1, how far it is believed to stand still.
+        go: times a second that one that stands still goes on; infinity where nobody looks.
+    """
+
+    held: float = 0.0
+    go: float = math.inf
+
+    @property
+    def rest(self) -> float:
+        """s until it goes on."""
+        return self.held / self.go
+
+    def gone(self, seconds: float) -> float:
+        """How long of so many seconds it goes, on the average, s."""
+        if not self.held or math.isinf(self.go):
+            return seconds
+        return seconds - self.held * -math.expm1(-self.go * seconds) / self.go
+
+
+def _waits(filter: InteractionFilter, memory: Any) -> Waits:
+    """Of a memory of the filter."""
+    pace = filter.pace
+    if pace is None or memory is None or memory.pace is None:
+        return Waits()
+    return Waits(float(pace.held(memory.pace)), float(pace.settings[1]))
 
 
 class Engine(Protocol):
@@ -32,6 +64,9 @@ class Engine(Protocol):
 
     def clock(self) -> tuple[float, float]:
         """Mean phase and mean phase velocity, 1/s."""
+
+    def waits(self) -> Waits:
+        """How far the interaction is believed to stand still, and for how long it will."""
 
     def finite(self) -> bool:
         """Whether the state is, and small enough for its variance to be."""
@@ -92,6 +127,10 @@ class _LiveEngine:
     def clock(self) -> tuple[float, float]:
         """See `Engine`."""
         return float(self._live.phase), float(self._live.phase_velocity)
+
+    def waits(self) -> Waits:
+        """See `Engine`."""
+        return _waits(self._live.filter, self._live.carrier.memory)
 
     def finite(self) -> bool:
         """See `Engine`."""
@@ -163,6 +202,11 @@ class _StateEngine:
     def clock(self) -> tuple[float, float]:
         """See `Engine`."""
         return float(self._filter.phase(self._state)), float(self._filter.phase_velocity(self._state))
+
+    @torch.no_grad()
+    def waits(self) -> Waits:
+        """See `Engine`."""
+        return _waits(self._filter, getattr(self._state, "memory", None))
 
     def finite(self) -> bool:
         """See `Engine`."""

@@ -164,10 +164,15 @@ class InteractionSession:
         with self._lock:
             self._timeline.advance(now)
             phase, velocity = self._timeline.phase_now()
+            waits = self._timeline.waits()
             if rate is not None:
-                end = min((1 - min(phase, 1.0)) / velocity, self._longest) if velocity > 0 else self._longest
+                end = self._longest
+                if velocity > 0:
+                    end = min((1 - min(phase, 1.0)) / velocity + waits.rest, self._longest)
                 horizons, several, horizon = sampled(horizons[0] if horizons else end, rate), True, 0.0
-            phases = [1.0] if horizon is None else [min(max(phase + velocity * h, 0.0), 1.0) for h in horizons]
+            phases = [1.0]
+            if horizon is not None:
+                phases = [min(max(phase + velocity * waits.gone(h), 0.0), 1.0) for h in horizons]
             expected = self._timeline.forecast(phases)
             mean, deviation = expected.mean, expected.variance.sqrt()
             if self._log is not None:
@@ -176,7 +181,7 @@ class InteractionSession:
             if not several:
                 mean, deviation = mean[0], deviation[0]
             phase = min(max(phase, 0.0), 1.0)
-            left = (1 - phase) / velocity if velocity > 0 else math.inf
+            left = (1 - phase) / velocity + waits.rest if velocity > 0 else math.inf
             now, stale = self._timeline.now, tuple(self.sensors[i] for i in self._timeline.stale())
             timeline = self._timeline
             return SessionForecast(

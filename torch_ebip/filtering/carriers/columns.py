@@ -19,7 +19,7 @@ class ColumnMembers:
         seen: int64 [k], ascending, the entries that stand still and that measurements depend on, counted from the
             first that stands still.
         moving: m, how many leading entries move.
-        first: as they started, [..., E, n], of members that have come some way; default: that is now.
+        first: as they started, [..., E, n], for `renew`; default: nobody knows.
 
     Attributes:
         matrix: [..., m + k + min(E, rest), E]; to be changed in place, and never replaced: others hold views of it.
@@ -44,7 +44,7 @@ class ColumnMembers:
         leading = start[..., torch.cat([torch.arange(moving, device=start.device), moving + seen])]
         self.matrix = torch.cat([leading, last], dim=-1).transpose(-1, -2).contiguous()
         self._still: Tensor | None = None
-        self._from = start if first is None else first
+        self._first = first
         self._order = torch.cat([seen, rest])
 
     @property
@@ -59,14 +59,15 @@ class ColumnMembers:
     def renew(self, share: Tensor) -> None:
         """Of what stands still a share [...] becomes what it was at first."""
         m, still = self._moving, self._still
+        if self._first is None:
+            return
         if still is None:
-            k = self._seen_count
-            still = self._from[..., m + self._order].transpose(-1, -2)
+            still = self._first[..., m + self._order].transpose(-1, -2)
             if self._transformed:
-                still = torch.cat(
-                    [still[..., :k, :], torch.eye(still.shape[-1]).to(still).expand(*still.shape[:-2], -1, -1)], -2
-                )
-            self._still = still = still.contiguous()
+                one = torch.eye(still.shape[-1], dtype=still.dtype, device=still.device)
+                seen = still[..., : self._seen_count, :]
+                still = torch.cat([seen, one.expand(*still.shape[:-2], -1, -1)], -2)
+            self._still = still
         self.matrix[..., m:, :].lerp_(still, share[..., None, None])
 
     def members(self, columns: Tensor, entry: int | None = None) -> Tensor:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
@@ -12,9 +10,7 @@ from torch_ebip.filtering.carriers.carrier import Carrier, Measured
 from torch_ebip.filtering.functional import Spread, Taper
 from torch_ebip.filtering.model import StateSpace
 from torch_ebip.filtering.states import EnsembleState
-from torch_ebip.filtering.updates.pace import Pace, led
 from torch_ebip.filtering.updates.rules import Rule
-from torch_ebip.filtering.updates.weighting import Seen
 
 
 class DenseCarrier(Carrier):
@@ -80,34 +76,3 @@ class DenseCarrier(Carrier):
         centred = self._state.centre is not None
         self._members = functional.apply_gain(moves, self._members, innovation, taper, weights, spread, centred)
         return functional.log_likelihood(innovation)
-
-
-def placed(
-    pace: Pace,
-    model: StateSpace,
-    state: EnsembleState,
-    y: Tensor,
-    observed: Tensor,
-    first: Callable[[EnsembleState], Tensor | None],
-) -> EnsembleState:
-    """A state whose members are where a pace leads them, now that a sample was seen.
-
-    Args:
-        pace: of the update.
-        model: of the members.
-        state: not changed.
-        y: [..., D], units of the DoFs.
-        observed: bool [..., D], something of it True.
-        first: says how members started, as deviations [..., E, n]; None where nobody knows.
-    """
-    members = state.deviations
-    moving, still = model.split(members)
-    mean = model.mean(moving, state.weights)
-    seen = Seen(y, observed, None, None, moving, mean, state.memory.origin)
-    memory, placement = pace.notice(state.memory.pace, seen)
-    if placement is not None:
-        start = first(state) if bool((placement.renewed > 0).any()) else None
-        if start is not None:
-            still = torch.lerp(still, start[..., moving.shape[-1] :], placement.renewed[..., None, None])
-        members = torch.cat([led(moving, mean, placement), still], -1)
-    return EnsembleState(members, state.memory._replace(pace=memory), state.centre)

@@ -137,3 +137,52 @@ def kept(
             store.popitem(last=False)
     store.move_to_end(key)
     return store[key]
+
+
+class Plans:
+    """A plan for each set of DoFs that are measured together; those used lately are kept.
+
+    Args:
+        measurement: of the sensors' DoFs.
+        members: that it projects.
+        centre: [..., k], see `Plan`.
+        sensors: the DoFs that may be measured, ascending.
+        terms: memory shared by all plans.
+    """
+
+    def __init__(
+        self,
+        measurement: ProjectsColumns,
+        members: ColumnMembers,
+        centre: Tensor,
+        sensors: Sequence[int],
+        terms: Tensor,
+    ) -> None:
+        self._parts = measurement, members, centre, terms
+        self._rows = {dof: row for row, dof in enumerate(sensors)}
+        self._kept: OrderedDict[tuple[bool, ...], Plan | None] = OrderedDict()
+
+    def of(self, measured: tuple[bool, ...]) -> Plan | None:
+        """That of some DoFs, a bool for each of the filter's; None for none.
+
+        Raises:
+            ValueError: a DoF that may not be measured.
+        """
+        return kept(self._kept, measured, self._make)
+
+    def forget_noise(self) -> None:
+        """R is another one."""
+        for plan in self._kept.values():
+            if plan is not None:
+                plan.noise = None
+
+    def _make(self, measured: tuple[bool, ...]) -> Plan | None:
+        dofs = [dof for dof, here in enumerate(measured) if here]
+        strangers = [dof for dof in dofs if dof not in self._rows]
+        if strangers:
+            raise ValueError(
+                f"DoFs {strangers[:8]} are measured, but are none of those this live filter was made for"
+            )
+        measurement, members, centre, terms = self._parts
+        rows = [self._rows[dof] for dof in dofs]
+        return Plan(measurement, members, centre, dofs, rows, terms) if dofs else None

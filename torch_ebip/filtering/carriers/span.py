@@ -15,18 +15,19 @@ asks for, and an update that mixes whole members.
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from torch_ebip.common.draws import Generators, is_several, standard_normal
+from torch_ebip.common.draws import Generators, fill_standard_normal, is_several, standard_normal
 from torch_ebip.common.modules import Versions
 from torch_ebip.filtering.carriers.carrier import Carrier, Measured
 from torch_ebip.filtering.carriers.columns import ColumnMembers
-from torch_ebip.filtering.carriers.plan import Plan, kept
+from torch_ebip.filtering.carriers.placing import place_columns
+from torch_ebip.filtering.carriers.plan import Plan, Plans
 from torch_ebip.filtering.carriers.serving import AdvancesColumns, HasFactor, ProjectsColumns, why_not_span
+from torch_ebip.filtering.carriers.step_noise import StepNoise
 from torch_ebip.filtering.centring import taken_out
 from torch_ebip.filtering.functional.innovation import Taper
 from torch_ebip.filtering.functional.linear import FactorisationError, cholesky
@@ -34,7 +35,6 @@ from torch_ebip.filtering.functional.moments import member_shares
 from torch_ebip.filtering.functional.update import Spread
 from torch_ebip.filtering.model import StateSpace
 from torch_ebip.filtering.states import EnsembleState, Memory, map_state
-from torch_ebip.filtering.updates.pace import led
 from torch_ebip.filtering.updates.rules import Columns, Rule
 from torch_ebip.filtering.updates.update import Update, analyse
 from torch_ebip.filtering.updates.weighting import Seen
@@ -78,8 +78,6 @@ class SpanCarrier(Carrier):
         if self._update.weighting is not None:
             self._update.weighting.at_work()
         self._slots, self._depends_on_state = self._update.slots, part.noise_depends_on_state
-        self._process, self._measurement = part.process_noise, part.measurement
-        self._sensors = {dof: row for row, dof in enumerate(view.dofs.tolist())}
         if state.centre is None:  # made by hand
             state = taken_out(model, state)
         assert state.centre is not None
@@ -88,8 +86,6 @@ class SpanCarrier(Carrier):
         self.batch_shape, m = tuple(start.shape[:-2]), part.moving
         seen = view.state[m:] - m
         self._columns = ColumnMembers(start, seen, m, first)
-        self._renews = first is not None
-        self._middle = state.centre[..., view.state[m:]]
         self.matrix, self._moving = self._columns.matrix, self._columns.moving
         self._advance = part.dynamics.advancer(self._moving)
         self._mean: Tensor | None = None  # as it is; None: to be computed
@@ -98,11 +94,11 @@ class SpanCarrier(Carrier):
         self._draws = start.new_empty(*start.shape[:-1], m)
         self._draws_by_entry = self._draws.transpose(-1, -2)
         self._equal = start.new_full((*self.batch_shape, E, 1), 1 / E)
-        self._terms = start.new_empty(math.prod(self.batch_shape) * len(seen) * E)
-        self._plans: OrderedDict[tuple[bool, ...], Plan | None] = OrderedDict()
+        terms = start.new_empty(math.prod(self.batch_shape) * len(seen) * E)
+        middle = state.centre[..., view.state[m:]]
+        self._plans = Plans(part.measurement, self._columns, middle, view.dofs.tolist(), terms)
         self._noise_versions = Versions(part.measurement_noise)
-        self._step_factor: tuple[float, Tensor, Tensor] | None = None
-        self._process_versions = Versions(part.process_noise)
+        self._steps = StepNoise(part.process_noise, self.matrix)
         batched = bool(self.batch_shape)
         self._add_product: Callable[..., Tensor] = Tensor.baddbmm_ if batched else Tensor.addmm_
         self._product: Callable[..., Tensor] = torch.bmm if batched else torch.mm
@@ -150,22 +146,18 @@ class SpanCarrier(Carrier):
 
     def predict(self, dt: float) -> None:
         """x = g(x) + N(0, Q) over dt seconds, finite and not negative."""
-        if self._process_versions.changed() or self._step_factor is None or self._step_factor[0] != dt:
-            seconds = self.matrix.new_tensor(dt)
-            factor = self._process.factor(seconds)
-            self._step_factor = dt, factor.expand(*self.batch_shape, *factor.shape[-2:]), seconds
-        self._mean = None
-        _, factor, seconds = self._step_factor
+        seconds, factor = self._steps.of(dt)
         memory = self.memory
+        self._mean = None
         if memory.pace is not None:
             self.memory, gone = self._update.elapse(memory, seconds)
+            factor = self._steps.noise.factor(gone)
             self._advance(gone)
-            factor = self._process.factor(gone)
         else:
-            self._advance(dt)
             if memory.weighting is not None or memory.surprise is not None or memory.recent is not None:
                 self.memory = self._update.forget(memory, seconds)
-        self._drawn(self._draws)
+            self._advance(dt)
+        fill_standard_normal(self._draws, self._generator)
         self._add_product(self._moving, factor, self._draws_by_entry)
 
     def take(self, y: Tensor, measured: tuple[bool, ...], mask: Tensor | None) -> Tensor:
@@ -182,7 +174,7 @@ class SpanCarrier(Carrier):
         Raises:
             ValueError: see `LiveFilter.update`.
         """
-        plan = kept(self._plans, measured, self._make_plan)
+        plan = self._plans.of(measured)
         perturbs, draws = self._slots.rule.perturbs, None
         if perturbs and is_several(self._generator):
             # What one sequence draws may not depend on what others measure.
@@ -193,7 +185,7 @@ class SpanCarrier(Carrier):
         if draws is not None:
             torch.index_select(draws, -1, plan.dofs, out=plan.draws)
         elif perturbs:
-            self._drawn(plan.draws)
+            fill_standard_normal(plan.draws, self._generator)
         self._place(plan, y, mask)
         sample = self._measure(plan, y, mask)
         return analyse(self._slots, self, sample, plan.draws_by_dof if perturbs else None)
@@ -239,7 +231,7 @@ class SpanCarrier(Carrier):
 
     def project(self, dofs: tuple[bool, ...]) -> Tensor:
         """[..., K], mean of h(x) of some of the sensors' DoFs, a bool for each DoF of the filter."""
-        plan = kept(self._plans, dofs, self._make_plan)
+        plan = self._plans.of(dofs)
         assert plan is not None
         return (plan.project() @ self._even).squeeze(-1)
 
@@ -276,24 +268,20 @@ class SpanCarrier(Carrier):
         if pace is None or memory.pace is None:
             return
         observed = None if mask is None else mask.index_select(-1, plan.dofs)
-        moving, mean = self.moving, self.mean
-        seen = Seen(y.index_select(-1, plan.dofs), observed, None, plan.rows, moving, mean, memory.origin)
+        values = y.index_select(-1, plan.dofs)
+        seen = Seen(values, observed, None, plan.rows, self.moving, self.mean, memory.origin)
         remembered, placement = pace.notice(memory.pace, seen)
         self.memory = memory._replace(pace=remembered)
         if placement is not None:
-            self._moving.copy_(led(moving, mean, placement).transpose(-1, -2))
+            place_columns(self._columns, self.mean, placement)
             self._mean = None
-            if self._renews and bool((placement.renewed > 0).any()):
-                self._columns.renew(placement.renewed)
 
     def _believed(self, plan: Plan) -> tuple[Tensor, Tensor, Tensor]:
         """R of a plan's DoFs, kept while no parameter changes, unless it depends on the state."""
         if self._depends_on_state:
             return plan.believe(self._model.deviation(self.mean))
         if self._noise_versions.changed():
-            for other in self._plans.values():
-                if other is not None:
-                    other.noise = None
+            self._plans.forget_noise()
         if plan.noise is None:
             plan.noise = plan.believe(self._model.deviation(None))
         return plan.noise
@@ -303,26 +291,6 @@ class SpanCarrier(Carrier):
         """What each member counts in a mean, [..., E, 1]."""
         weighting = self.memory.weighting
         return self._equal if weighting is None else weighting.weights.unsqueeze(-1)
-
-    def _drawn(self, buffer: Tensor) -> Tensor:
-        """The buffer, filled with standard-normal draws: those that `standard_normal` would make."""
-        generator = self._generator
-        if generator is None or (isinstance(generator, torch.Generator) and generator.device == buffer.device):
-            return buffer.normal_(generator=generator)
-        return buffer.copy_(standard_normal(buffer.shape, buffer, generator))
-
-    def _make_plan(self, measured: tuple[bool, ...]) -> Plan | None:
-        """Buffers for the DoFs that are measured together; None for none."""
-        dofs = [dof for dof, here in enumerate(measured) if here]
-        strangers = [dof for dof in dofs if dof not in self._sensors]
-        if strangers:
-            raise ValueError(
-                f"DoFs {strangers[:8]} are measured, but are none of those this live filter was made for"
-            )
-        if not dofs:
-            return None
-        rows = [self._sensors[dof] for dof in dofs]
-        return Plan(self._measurement, self._columns, self._middle, dofs, rows, self._terms)
 
     def _explain(self, S: Tensor, plan: Plan) -> None:
         try:

@@ -1,0 +1,53 @@
+"""Leading members back where a `Pace` has them, before they take in a sample: for both carriers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from torch_ebip.filtering.carriers.columns import ColumnMembers
+from torch_ebip.filtering.model import StateSpace
+from torch_ebip.filtering.states import EnsembleState
+from torch_ebip.filtering.updates.pace import Pace, Placement, led
+from torch_ebip.filtering.updates.weighting import Seen
+
+
+def placed(
+    pace: Pace,
+    model: StateSpace,
+    state: EnsembleState,
+    y: Tensor,
+    observed: Tensor,
+    first: Callable[[EnsembleState], Tensor | None],
+) -> EnsembleState:
+    """A state whose members are where a pace leads them, now that a sample was seen.
+
+    Args:
+        pace: of the update.
+        model: of the members.
+        state: not changed.
+        y: [..., D], units of the DoFs.
+        observed: bool [..., D], something of it True.
+        first: says how members started, as deviations [..., E, n]; None where nobody knows.
+    """
+    members = state.deviations
+    moving, still = model.split(members)
+    mean = model.mean(moving, state.weights)
+    seen = Seen(y, observed, None, None, moving, mean, state.memory.origin)
+    memory, placement = pace.notice(state.memory.pace, seen)
+    if placement is not None:
+        start = first(state) if bool((placement.renewed > 0).any()) else None
+        if start is not None:
+            still = torch.lerp(still, start[..., moving.shape[-1] :], placement.renewed[..., None, None])
+        members = torch.cat([led(moving, mean, placement), still], -1)
+    return EnsembleState(members, state.memory._replace(pace=memory), state.centre)
+
+
+def place_columns(columns: ColumnMembers, mean: Tensor, placement: Placement) -> None:
+    """Lead members that are columns, whose moving entries have a mean [..., m]; what stands still is renewed."""
+    moving = columns.moving
+    moving.copy_(led(moving.transpose(-1, -2), mean, placement).transpose(-1, -2))
+    if bool((placement.renewed > 0).any()):
+        columns.renew(placement.renewed)
