@@ -44,7 +44,7 @@ ANEW = 0.2
 HELD = 0.4, 0.8
 """Probability of standing still from which on the ensemble's clock is held, and from which on altogether: it would be
 behind if it were held a little all the time."""
-AGREE, DIFFER = 2.0, 4.0
+AGREE, DIFFER = 1.0, 3.0
 """Deviations apart up to which the ensemble is believed, and from which on the bank."""
 
 
