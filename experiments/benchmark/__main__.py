@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 from tqdm import tqdm
 
-from experiments.benchmark import bending, caution, growth, sequences, startup, step
+from experiments.benchmark import bending, caution, growth, pausing, sequences, startup, step
 from experiments.command_line import add_run_options, command, experiment_parser
 from experiments.run_folder import RunFolder, save_figure
 
@@ -44,6 +44,7 @@ def main(arguments: list[str] | None = None) -> None:
         "growth": lambda: growth.growth(rounds // 2, seed),
         "caution": lambda: caution.caution(2 * rounds, seed, options.quick),
         "bending": lambda: bending.bending(rounds, seed, options.quick),
+        "pausing": lambda: pausing.pausing(rounds, seed, options.quick),
         "fold": lambda: sequences.fold(1 if options.quick else 3, seed, samples),
         "tuning": lambda: sequences.tuning(seed, samples=samples),
         "startup": lambda: startup.startup(run.path, 2 if options.quick else 5),
@@ -124,6 +125,13 @@ def _print(results: Mapping[str, Any]) -> None:
         keys = ("heard", "bends", "straight", "update", "update_heard", "bends_over_update", "heard_over_update")
         numbers = tuple(row[key] for key in keys)
         table.add_row(str(row["horizons"]), *(f"{number:.3g}" for number in numbers))
+    console.print(table)
+    table = _table(
+        "a bank of phase hypotheses: a live step, E = 80, 1 thread, us", ["what", "with", "without", "ratio"]
+    )
+    for row in results["pausing"]:
+        numbers = (row["with"], row["without"], row["with_over_without"])
+        table.add_row(row["what"], *(f"{number:.3g}" for number in numbers))
     console.print(table)
     heads = ["sensors", "threads", "us a step and interaction", "one at a time / together"]
     table = _table("a fold: 22 x 198 members x 100 samples x 559 weights", [*heads, "stepwise / together"])

@@ -33,7 +33,7 @@ from torch_ebip.interaction.horizons import HorizonShrinkage
 from torch_ebip.interaction.mixture import MixturePrior
 from torch_ebip.interaction.model import demonstration_states, interaction_model
 from torch_ebip.interaction.noise import InteractionNoise, PhaseNoise, WeightNoise
-from torch_ebip.interaction.phase_bank import PhaseBank
+from torch_ebip.interaction.pace.phase_bank import PhaseBank
 from torch_ebip.interaction.phases import *
 from torch_ebip.interaction.presets import bip, ebip, ebip_minus, particle_filter
 from torch_ebip.interaction.primitive import InteractionPrimitive

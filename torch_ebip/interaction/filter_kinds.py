@@ -47,8 +47,8 @@ class InteractionMemberFilter(InteractionFilter, MemberFilter):
         moving = self.model.split(members)[0]
         now, velocity = moving[..., 0].unsqueeze(-2), self.phase_model.velocity(moving).unsqueeze(-2)
         seconds, end = ahead.unsqueeze(-1), ahead.isinf().unsqueeze(-1)
-        if self.pace is not None and (held := self.whereabouts(state)) is not None:
-            seconds = self.pace.gone_apart(held, ahead, members.shape[-2])
+        if (waits := self.waits(state)) is not None:
+            seconds = waits.gone_apart(ahead, members.shape[-2])
         # A member that runs backwards, of a hand that goes back, waits: it has no end to come to.
         phase = now + velocity.clamp(min=0) * torch.where(end, 0, seconds)
         phase = torch.where(end, 1, phase).clamp(max=1)

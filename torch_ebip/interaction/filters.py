@@ -19,7 +19,8 @@ from torch_ebip.interaction.attribution import affine_coefficients
 from torch_ebip.interaction.bounds import Bounds
 from torch_ebip.interaction.doubt import Doubt
 from torch_ebip.interaction.forecast import Forecast, Phases, as_phases, as_seconds_ahead
-from torch_ebip.interaction.phase_bank import PhaseBank, Whereabouts
+from torch_ebip.interaction.pace.phase_bank import PhaseBank
+from torch_ebip.interaction.pace.waiting import Waits
 from torch_ebip.interaction.phases.phase import PhaseModel
 from torch_ebip.interaction.present import Present, present_of
 from torch_ebip.interaction.projection import BasisProjection
@@ -129,8 +130,8 @@ class InteractionFilter(Filter):
         if self.readout is None and self.doubt is None and self.bounds is None:
             return forecast
         lead = self.lead(state, forecast.phase, seconds)
-        if seconds is not None and self.pace is not None and (held := self.whereabouts(state)) is not None:
-            lead = lead._replace(gone=self.pace.gone(held, seconds))
+        if seconds is not None and (waits := self.waits(state)) is not None:
+            lead = lead._replace(gone=waits.gone(seconds))
         mean, variance = self.demonstrated(lead.phase)
         if self.readout is not None:
             present = self.present(state) if self.readout.reads_present else None
@@ -184,10 +185,11 @@ class InteractionFilter(Filter):
             )
         count = len(self.prior.states)  # type: ignore[arg-type]
         found = present_of(state[0][..., 0], memory, recent, count)
-        if self.pace is None or memory.pace is None:
+        waits = self.waits(state)
+        if waits is None:
             return found
         # Who stands still has a velocity that says nothing of where: no demonstration stood there.
-        going = (1 - self.pace.held(memory.pace)).unsqueeze(-1)
+        going = (1 - waits.held).unsqueeze(-1)
         return found._replace(line=found.line._replace(moves=found.line.moves * going))
 
     def doubted(self, state: State) -> Tensor:
@@ -215,11 +217,10 @@ class InteractionFilter(Filter):
         found = getattr(getattr(self, "analysis", None), "pace", None)
         return found if isinstance(found, PhaseBank) else None
 
-    def whereabouts(self, state: State) -> Whereabouts | None:
-        """What a ``state`` remembers for `pace`; None if nothing."""
-        memory = getattr(state, "memory", None)
-        held: Whereabouts | None = None if memory is None else memory.pace
-        return held
+    def waits(self, state: State) -> Waits | None:
+        """Whether the person of a ``state`` stands still; None where nobody looks."""
+        memory, pace = getattr(state, "memory", None), self.pace
+        return None if memory is None or memory.pace is None or pace is None else pace.waits(memory.pace)
 
     @eager
     def familiarity(self, state: State) -> Tensor:

@@ -23,7 +23,7 @@ from torch_ebip.interaction.filter_kinds import (
 )
 from torch_ebip.interaction.mixture import MixturePrior, fit_responsibilities
 from torch_ebip.interaction.model import demonstration_states, interaction_model
-from torch_ebip.interaction.phase_bank import PhaseBank
+from torch_ebip.interaction.pace.phase_bank import PhaseBank
 from torch_ebip.interaction.phases.phase import PhaseModel
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.interaction.priors import DemonstrationPrior, MomentPrior

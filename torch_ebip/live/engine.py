@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -13,38 +12,8 @@ from torch_ebip.filtering.sequence import surprise_of
 from torch_ebip.interaction.filter_kinds import InteractionEnsembleFilter
 from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.forecast import Forecast
+from torch_ebip.interaction.pace.waiting import Waits
 from torch_ebip.live.filter import LiveFilter, LiveSnapshot
-
-
-class Waits(NamedTuple):
-    """Whether an interaction goes on.
-
-    Attributes:
-        held: 0 to 1, how far it is believed to stand still.
-        go: times a second that one that stands still goes on; infinity where nobody looks.
-    """
-
-    held: float = 0.0
-    go: float = math.inf
-
-    @property
-    def rest(self) -> float:
-        """s until it goes on."""
-        return self.held / self.go
-
-    def gone(self, seconds: float) -> float:
-        """How long of so many seconds it goes, on the average, s."""
-        if not self.held or math.isinf(self.go):
-            return seconds
-        return seconds - self.held * -math.expm1(-self.go * seconds) / self.go
-
-
-def _waits(filter: InteractionFilter, memory: Any) -> Waits:
-    """Of a memory of the filter."""
-    pace = filter.pace
-    if pace is None or memory is None or memory.pace is None:
-        return Waits()
-    return Waits(float(pace.held(memory.pace)), float(pace.settings[1]))
 
 
 class Engine(Protocol):
@@ -65,8 +34,8 @@ class Engine(Protocol):
     def clock(self) -> tuple[float, float]:
         """Mean phase and mean phase velocity, 1/s."""
 
-    def waits(self) -> Waits:
-        """How far the interaction is believed to stand still, and for how long it will."""
+    def waits(self) -> Waits | None:
+        """Whether the person stands still; None where nobody looks."""
 
     def finite(self) -> bool:
         """Whether the state is, and small enough for its variance to be."""
@@ -128,9 +97,9 @@ class _LiveEngine:
         """See `Engine`."""
         return float(self._live.phase), float(self._live.phase_velocity)
 
-    def waits(self) -> Waits:
+    def waits(self) -> Waits | None:
         """See `Engine`."""
-        return _waits(self._live.filter, self._live.carrier.memory)
+        return self._live.waits
 
     def finite(self) -> bool:
         """See `Engine`."""
@@ -204,9 +173,9 @@ class _StateEngine:
         return float(self._filter.phase(self._state)), float(self._filter.phase_velocity(self._state))
 
     @torch.no_grad()
-    def waits(self) -> Waits:
+    def waits(self) -> Waits | None:
         """See `Engine`."""
-        return _waits(self._filter, getattr(self._state, "memory", None))
+        return self._filter.waits(self._state)
 
     def finite(self) -> bool:
         """See `Engine`."""

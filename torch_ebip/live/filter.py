@@ -25,6 +25,7 @@ from torch_ebip.filtering.states import EnsembleState, Memory
 from torch_ebip.interaction.analogue_readout import AnalogueReadout
 from torch_ebip.interaction.filter_kinds import InteractionEnsembleFilter
 from torch_ebip.interaction.forecast import Forecast, Phases
+from torch_ebip.interaction.pace.waiting import Waits
 
 
 class LiveSnapshot(NamedTuple):
@@ -188,6 +189,14 @@ class LiveFilter:
         if surprise is None or felt is None:
             return self.phase * torch.nan
         return surprise.familiarity(felt)
+
+    @property
+    @in_own_modes
+    @torch.no_grad()
+    def waits(self) -> Waits | None:
+        """Whether the person stands still; None where nobody looks."""
+        pace, memory = self.filter.pace, self.carrier.memory
+        return None if pace is None or memory.pace is None else pace.waits(memory.pace)
 
     @property
     def counts(self) -> Tensor | None:

@@ -164,15 +164,16 @@ class InteractionSession:
         with self._lock:
             self._timeline.advance(now)
             phase, velocity = self._timeline.phase_now()
-            waits = self._timeline.waits()
+            rest = self._timeline.rest()
             if rate is not None:
                 end = self._longest
                 if velocity > 0:
-                    end = min((1 - min(phase, 1.0)) / velocity + waits.rest, self._longest)
+                    end = min((1 - min(phase, 1.0)) / velocity + rest, self._longest)
                 horizons, several, horizon = sampled(horizons[0] if horizons else end, rate), True, 0.0
             phases = [1.0]
             if horizon is not None:
-                phases = [min(max(phase + velocity * waits.gone(h), 0.0), 1.0) for h in horizons]
+                gone = self._timeline.gone(horizons)
+                phases = [min(max(phase + velocity * seconds, 0.0), 1.0) for seconds in gone]
             expected = self._timeline.forecast(phases)
             mean, deviation = expected.mean, expected.variance.sqrt()
             if self._log is not None:
@@ -181,7 +182,7 @@ class InteractionSession:
             if not several:
                 mean, deviation = mean[0], deviation[0]
             phase = min(max(phase, 0.0), 1.0)
-            left = (1 - phase) / velocity + waits.rest if velocity > 0 else math.inf
+            left = (1 - phase) / velocity + rest if velocity > 0 else math.inf
             now, stale = self._timeline.now, tuple(self.sensors[i] for i in self._timeline.stale())
             timeline = self._timeline
             return SessionForecast(

@@ -14,7 +14,7 @@ from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.forecast import Forecast
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.interaction.surprise_memory import STATES, state_of
-from torch_ebip.live.engine import Waits, make_engine
+from torch_ebip.live.engine import make_engine
 from torch_ebip.live.intake import Array, Freshness, Intake, SensorReport, as_vector, training_ranges
 from torch_ebip.live.opening import Clock, Lost, Opening
 from torch_ebip.live.settings import SessionSettings, patience_of
@@ -161,11 +161,17 @@ class Timeline:
         """Phase and its velocity, 1/s, at the present: since the last tick the interaction went on."""
         phase, velocity = self._engine.clock()
         since = 0.0 if self.waiting else self._now - self._time(max(self._head, 0))
-        return phase + velocity * self._engine.waits().gone(since), velocity
+        return phase + velocity * self.gone([since])[0], velocity
 
-    def waits(self) -> Waits:
-        """Whether the interaction goes on."""
-        return self._engine.waits()
+    def gone(self, seconds: Sequence[float]) -> list[float]:
+        """How long of so many seconds the interaction goes on, s."""
+        waits = self._engine.waits()
+        return list(seconds) if waits is None else waits.gone(self._like.new_tensor(seconds)).tolist()
+
+    def rest(self) -> float:
+        """How long it will stand still first, s."""
+        waits = self._engine.waits()
+        return 0.0 if waits is None else float(waits.rest)
 
     def forecast(self, phases: Sequence[float]) -> Forecast:
         """Of the controlled DoFs at some phases."""

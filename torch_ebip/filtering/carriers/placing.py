@@ -41,13 +41,14 @@ def placed(
         start = first(state) if bool((placement.renewed > 0).any()) else None
         if start is not None:
             still = torch.lerp(still, start[..., moving.shape[-1] :], placement.renewed[..., None, None])
-        members = torch.cat([led(moving, mean, placement), still], -1)
+        first_entry = led(moving[..., 0], mean[..., 0], placement).unsqueeze(-1)
+        members = torch.cat([first_entry, moving[..., 1:], still], -1)
     return EnsembleState(members, state.memory._replace(pace=memory), state.centre)
 
 
 def place_columns(columns: ColumnMembers, mean: Tensor, placement: Placement) -> None:
     """Lead members that are columns, whose moving entries have a mean [..., m]; what stands still is renewed."""
-    moving = columns.moving
-    moving.copy_(led(moving.transpose(-1, -2), mean, placement).transpose(-1, -2))
+    phase = columns.moving.select(-2, 0)
+    phase.copy_(led(phase, mean.select(-1, 0), placement))
     if bool((placement.renewed > 0).any()):
         columns.renew(placement.renewed)

@@ -151,8 +151,8 @@ class SpanCarrier(Carrier):
         self._mean = None
         if memory.pace is not None:
             self.memory, gone = self._update.elapse(memory, seconds)
-            factor = self._steps.noise.factor(gone)
-            self._advance(gone)
+            self._advance(dt if gone is seconds else gone)
+            factor = factor if gone is seconds else self._steps.noise.factor(gone)
         else:
             if memory.weighting is not None or memory.surprise is not None or memory.recent is not None:
                 self.memory = self._update.forget(memory, seconds)

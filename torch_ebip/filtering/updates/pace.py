@@ -18,13 +18,13 @@ from torch_ebip.filtering.updates.weighting import Seen
 
 
 class Placement(NamedTuple):
-    """Where members are led: what moves, x, becomes mean + offset + stretch (x - mean).
+    """Where members are led: the first of their entries that move, x, becomes mean + offset + stretch (x - mean).
 
     What stands still was learned where a sequence was not: of it a share becomes what it was at first.
 
     Attributes:
-        offset: [..., m].
-        stretch: [..., m], not negative.
+        offset: [...].
+        stretch: [...], not negative.
         renewed: [...], in [0, 1].
     """
 
@@ -57,11 +57,11 @@ class Pace(Part, ABC):
         """The memory after a sample that was ``seen``, and where members are led before they take it in."""
 
     @abstractmethod
-    def counts(self, memory: Any) -> Tensor:
-        """[...], in (0, 1], what a sample counts: of what stands still every further one says the same."""
+    def counts(self, memory: Any) -> Tensor | None:
+        """[...], in (0, 1], what a sample counts: of what stands still every further one says the same. None: 1."""
 
 
-def led(moving: Tensor, mean: Tensor, placement: Placement) -> Tensor:
-    """What moves [..., E, m] of members with a mean [..., m], where a placement leads them."""
-    centre = (mean + placement.offset).unsqueeze(-2)
-    return centre + (moving - mean.unsqueeze(-2)) * placement.stretch.unsqueeze(-2)
+def led(first: Tensor, mean: Tensor, placement: Placement) -> Tensor:
+    """The first entry [..., E] of members, with a mean [...], where a placement leads it."""
+    apart = (first - mean.unsqueeze(-1)) * placement.stretch.unsqueeze(-1)
+    return apart + (mean + placement.offset).unsqueeze(-1)

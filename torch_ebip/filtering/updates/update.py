@@ -212,8 +212,10 @@ def analyse(slots: Slots, carrier: Carrier, measured: Measured, perturbations: T
     return likelihood
 
 
-def _counted(measured: Measured, counts: Tensor) -> Measured:
-    """A sample of which every value counts so much, [...], in (0, 1]."""
+def _counted(measured: Measured, counts: Tensor | None) -> Measured:
+    """A sample of which every value counts so much, [...], in (0, 1]; None: 1."""
+    if counts is None:
+        return measured
     return measured._replace(deviation=measured.deviation / counts.sqrt().unsqueeze(-1))
 
 

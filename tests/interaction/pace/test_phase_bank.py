@@ -23,8 +23,10 @@ from torch_ebip import (
     ebip,
 )
 from torch_ebip.filtering.updates.weighting import Seen
-from torch_ebip.interaction.likeness import CAP
-from torch_ebip.interaction.phase_bank import CHANCES, IDLE, RATES, Whereabouts, transition_of
+from torch_ebip.interaction.pace.likeness import CAP
+from torch_ebip.interaction.pace.moves import CHANCES, RATES, transition_of
+from torch_ebip.interaction.pace.phase_bank import IDLE
+from torch_ebip.interaction.pace.whereabouts import Whereabouts
 from torch_ebip.interaction.table import DemonstrationTable
 
 HUMAN = torch.tensor([True, True, True, False, False])
@@ -56,7 +58,10 @@ def numpy_bank(values: np.ndarray, times: np.ndarray, bank: PhaseBank) -> list[n
     table = DemonstrationTable.of(primitive, bank.likeness.n_phases)
     f = table.values[..., :3].numpy()
     df = table.slopes[..., :3].numpy() * primitive.phase_velocity.numpy()[:, None, None]
-    q, q_velocity = 1 / bank.likeness.precision.numpy()
+    precision, order = bank.likeness.precision.numpy(), bank.likeness.order
+    assert order.tolist()[0] == [0, 1]
+    assert order.tolist()[1][0] == 2
+    q, q_velocity = (1 / np.append(each[0], each[1, 0]) for each in precision)
     stop, go, jump, by_value, by_velocity, late = bank.settings.tolist()
     N, P, _ = f.shape
     pace = primitive.phase_velocity.numpy()
@@ -122,6 +127,11 @@ def numpy_bank(values: np.ndarray, times: np.ndarray, bank: PhaseBank) -> list[n
     return told
 
 
+def by_mode(share: torch.Tensor) -> np.ndarray:
+    """Shares [2, N, P] of [N, 2 P]."""
+    return np.stack(np.split(share.numpy(), 2, axis=-1))
+
+
 def test_it_is_the_point_mass_filter_of_its_docstring() -> None:
     """Shares of every triple, step by step, with gaps and samples that are not evenly spaced."""
     bank = PhaseBank.of(small_primitive(torch.float64), phases=7, most=24, period=0.06)
@@ -139,7 +149,7 @@ def test_it_is_the_point_mass_filter_of_its_docstring() -> None:
             before = state.memory.pace.share
             state, _ = made.update(state, torch.cat([row, torch.full((2,), torch.nan)]))
             if not torch.equal(state.memory.pace.share, before):
-                found.append(state.memory.pace.share.numpy())
+                found.append(by_mode(state.memory.pace.share))
     assert len(found) == len(expected) >= 6
     for ours, theirs in zip(found, expected, strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-9)
@@ -173,8 +183,9 @@ def test_the_time_that_is_gone_is_that_of_a_person_who_waits(held: float) -> Non
     seconds = torch.tensor([0.2, 1.0, 4.0, math.inf]).double()
     generator = np.random.default_rng(0)
     waits = np.where(generator.random(200_000) < held, generator.exponential(1 / 1.5, 200_000), 0)
-    gone = bank.gone(memory, seconds)
-    apart = bank.gone_apart(memory, seconds, 500)
+    told = bank.waits(memory)
+    gone, apart = told.gone(seconds), told.gone_apart(seconds, 500)
+    assert float(told.rest) == pytest.approx(waits.mean(), abs=0.01)
     assert gone[3].isinf()
     assert apart[3].isinf().all()
     for i in range(3):
@@ -191,7 +202,7 @@ def test_nothing_is_known_of_a_demonstration_that_is_not_a_member() -> None:
         torch.tensor(0.3).double(), small_primitive(torch.float64).weights[5]), torch.nan)  # fmt: skip
     state, _ = made.update(state, y)
     share = state.memory.pace.share
-    assert not share[:, 5].any()
+    assert not share[5].any()
     assert float(share.sum()) == pytest.approx(1)
 
 
@@ -299,7 +310,7 @@ def test_both_engines_and_the_live_path_give_the_same() -> None:
 
 
 def test_units_and_translation_change_nothing() -> None:
-    """Shares [2, N, P] of the same recordings in millimetres and from another origin."""
+    """Shares [N, 2 P] of the same recordings in millimetres and from another origin."""
     plain = interactions(24, dtype=torch.float64)
     told = []
     for scale, offset in ((1.0, 0.0), (1000.0, 0.0), (1.0, 50.0)):

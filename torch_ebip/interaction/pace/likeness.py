@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torch_ebip.common.ambient import owned
+from torch_ebip.interaction.pace.moves import RATES
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.interaction.table import DemonstrationTable
 
@@ -28,15 +29,19 @@ class Likeness(nn.Module):
         error: [2, k], mean squares that are usual of values and velocities.
         dofs: int64 [k], which of the layout's DoFs these are.
         sensor_of_dof: int64 [k], numbered from 0.
+
+    Attributes:
+        order: int64 [S, w], the DoFs of each sensor; where it has fewer than w any, of no precision.
+        middle: [S, w], units of the DoFs, that all distances are taken from.
+
+    Raises:
+        ValueError: shapes that do not fit.
     """
 
-    values: Tensor
     blocks: Tensor
     precision: Tensor
     middle: Tensor
-    dofs: Tensor
-    place: Tensor
-    counted: Tensor
+    order: Tensor
     phases: Tensor
 
     def __init__(
@@ -50,81 +55,62 @@ class Likeness(nn.Module):
                 f"got {list(values.shape)}, {list(velocities.shape)}, {list(error.shape)}, {len(dofs)}, "
                 f"{len(sensor_of_dof)}"
             )
-        sensors = torch.nn.functional.one_hot(sensor_of_dof).to(values)  # [k, S]
-        widest = int(sensors.sum(0).max())
-        # Of each DoF its place in its sensor, so that all sensors are one product.
-        within = (sensors.cumsum(0) * sensors).sum(-1).long() - 1
-        place = sensor_of_dof * widest + within
+        sensors = nn.functional.one_hot(sensor_of_dof)  # [k, S]
+        S, w = sensors.shape[1], int(sensors.sum(0).max())
+        place = sensor_of_dof * w + (sensors.cumsum(0) * sensors).sum(-1) - 1
         # Products are formed of deviations, never of values whose mean cancels only in exact arithmetic.
         middle = values.mean((0, 1))
         apart = values - middle
-        parts = torch.stack([apart.square(), apart, velocities.square(), velocities], -1)  # [N, P, k, 4]
-        blocks = values.new_zeros(N, P, sensors.shape[1] * widest, 4)
-        blocks[:, :, place] = parts
-        blocks = blocks.view(N * P, sensors.shape[1], widest * 4).permute(1, 2, 0).contiguous()  # [S, 4 w, N P]
+        parts = torch.stack([apart.square(), apart, velocities.square(), velocities])  # [4, N, P, k]
+        blocks = values.new_zeros(4, N, P, S * w)
+        blocks[..., place] = parts
+        blocks = blocks.view(4, N * P, S, w).permute(2, 0, 3, 1).reshape(S, 4 * w, N * P)
+        placed = values.new_zeros(3, S * w)
+        placed[:, place] = torch.stack([middle, *(1 / error)])
+        order = dofs.new_zeros(S * w)
+        order[place] = dofs
         for name, tensor in (
             ("blocks", blocks),
-            ("precision", 1 / error),
-            ("middle", middle),
-            ("dofs", dofs),
-            ("place", place),
-            ("counted", sensors),
+            ("middle", placed[0].view(S, w)),
+            ("precision", placed[1:].view(2, S, w)),
+            ("order", order.view(S, w)),
             ("phases", torch.linspace(0, 1, P, dtype=values.dtype, device=values.device)),
         ):
             self.register_buffer(name, owned(tensor), persistent=False)
-        self.n_demonstrations, self.n_phases, self._widest = N, P, widest
+        self.n_demonstrations, self.n_phases = N, P
 
-    def forward(
-        self,
-        value: Tensor,
-        velocity: Tensor,
-        there: Tensor,
-        moves: Tensor,
-        by_value: Tensor,
-        by_velocity: Tensor,
-        rates: tuple[float, float],
-    ) -> Tensor:
-        """Logarithms [..., 2, N, P] of what going and standing make of a sample, up to a constant; see `PhaseBank`.
+    def forward(self, apart: Tensor, velocity: Tensor, known: Tensor, strength: Tensor) -> Tensor:
+        """Logarithms [R, N, 2 P] of what going and standing make of R samples, up to a constant; see `PhaseBank`.
 
         Args:
-            value: [..., D], units of the DoFs.
-            velocity: [..., D], units of the DoFs a second.
-            there, moves: bool [..., D], where there is a value, and a velocity.
-            by_value, by_velocity: scalars, what each distance counts.
-            rates: least and largest of a person who goes.
+            apart: [R, S, w], values less `middle`, units of the DoFs; 0 where there are none.
+            velocity: [R, S, w], units of the DoFs a second; 0 where there is none.
+            known: [2, R, S, w], 1 where there is a value, and a velocity; otherwise 0.
+            strength: [2], what distances of values and velocities count.
         """
-        batch, dofs = value.shape[:-1], self.dofs
-        parts = (part.reshape(-1, part.shape[-1])[:, dofs] for part in (value, velocity, there, moves))
-        x, u, here, going = parts
-        x = torch.where(here, x - self.middle, 0)
-        shares = torch.stack([here, going]).to(x)  # [2, R, k]
-        counted = shares @ self.counted @ self.counted.T  # how many of its sensor
-        weight = self.precision.unsqueeze(1) * shares / counted.clamp(min=1)
-        w, v = weight.unbind()
-        none = torch.zeros_like(w)
-        rows = torch.stack([w, -2 * w * x, none, none, none, none, v, none, none, none, none, v * u], -1)
-        R = len(x)
-        S, F, NP = self.blocks.shape
-        placed = x.new_zeros(R, S * self._widest, 12)
-        placed[:, self.place] = rows
-        placed = placed.view(R, S, self._widest, 3, 4).permute(1, 0, 3, 2, 4).reshape(S, 3 * R, F)
-        products = torch.bmm(placed, self.blocks).view(S, R, 3, NP)
-        own = torch.stack([w * x * x, v * u * u]) @ self.counted  # [2, R, S]
-        near, still = own.transpose(1, 2).unsqueeze(-1)  # [S, R, 1]
-        near = near + products[:, :, 0]
-        square, along = products[:, :, 1], products[:, :, 2]
-        least = torch.finfo(x.dtype).tiny
-        rate = (along.sum(0) / square.sum(0).clamp(min=least)).clamp(*rates)
-        moved = still + rate * (rate * square - 2 * along)
-        where = by_value * near.clamp(max=CAP).sum(0)
-        both = [by_velocity * moved.clamp(max=CAP).sum(0), (by_velocity * still.clamp(max=CAP).sum(0)).expand(R, NP)]
-        log = -0.5 * (where.unsqueeze(1) + torch.stack(both, 1))
-        both_modes: Tensor = log.view(*batch, 2, self.n_demonstrations, self.n_phases)
-        return both_modes
+        R, S, _ = apart.shape
+        known = known * (self.precision > 0).unsqueeze(1)
+        shares = known / known.sum(-1, keepdim=True).clamp(min=1)
+        w, v = (self.precision.unsqueeze(1) * (strength[:, None, None, None] * shares)).unbind()
+        wx, vu, none = w * apart, v * velocity, torch.zeros_like(w)
+        rows = torch.stack([w, -2 * wx, none, none, none, none, v, none, none, none, none, vu], -2)
+        rows = rows.view(R, S, 3, -1).transpose(0, 1).reshape(S, 3 * R, -1)
+        near, square, along = torch.bmm(rows, self.blocks).view(S, R, 3, -1).unbind(2)  # [S, R, N P]
+        own = torch.stack([wx * apart, vu * velocity]).sum(-1).transpose(1, 2).unsqueeze(-1)  # [2, S, R, 1]
+        caps = CAP * strength
+        least = torch.finfo(apart.dtype).tiny
+        rate = (along.sum(0) / square.sum(0).clamp(min=least)).clamp(RATES[0], RATES[-1])
+        moved = own[1] + rate * torch.addcmul(-2 * along, rate, square)
+        where = torch.minimum(own[0] + near, caps[0]).sum(0)
+        going = where + torch.minimum(moved, caps[1]).sum(0)
+        standing = where + torch.minimum(own[1], caps[1]).sum(0)
+        shape = R, self.n_demonstrations, self.n_phases
+        return -0.5 * torch.cat([going.view(shape), standing.view(shape)], -1)
 
     def extra_repr(self) -> str:
         """Sizes."""
-        return f"{self.n_demonstrations} demonstrations, {self.n_phases} phases, {len(self.dofs)} DoFs"
+        count = int((self.precision[0] > 0).sum())
+        return f"{self.n_demonstrations} demonstrations, {self.n_phases} phases, {count} DoFs"
 
 
 def likeness_of(primitive: InteractionPrimitive, phases: int, most: int) -> tuple[Likeness, Tensor]:

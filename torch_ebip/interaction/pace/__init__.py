@@ -1,0 +1,1 @@
+"""Where in an interaction a person is who pauses, starts late or starts over."""

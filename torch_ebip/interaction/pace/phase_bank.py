@@ -1,0 +1,290 @@
+"""A bank of phase hypotheses: where in the interaction a person is, who may pause, go on, start over, or start late.
+
+A point-mass filter (Bucy & Senne 1971; Anderson & Moore 1979, section 8.4) over triples of a demonstration, a phase
+on a grid and a mode, going or standing still. It is not linear in anything, and keeps every possibility alive: the
+ensemble, which is far more exact where it is right, is led back where it is lost. Given the phase, the weights are
+the ensemble's (Rao-Blackwellised: Doucet, de Freitas, Murphy & Russell 2000).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_ebip.common.ambient import owned
+from torch_ebip.common.arguments import as_count, as_number
+from torch_ebip.common.modules import sharing
+from torch_ebip.filtering.model import StateSpace
+from torch_ebip.filtering.protocols import View
+from torch_ebip.filtering.updates.pace import Pace, Placement
+from torch_ebip.filtering.updates.weighting import Seen
+from torch_ebip.interaction.pace.likeness import Likeness, likeness_of
+from torch_ebip.interaction.pace.moves import Moves, moves_of, transition_of
+from torch_ebip.interaction.pace.waiting import Waits
+from torch_ebip.interaction.pace.whereabouts import Whereabouts, chosen, closed
+from torch_ebip.interaction.primitive import InteractionPrimitive
+from torch_ebip.recordings.layout import Layout
+
+SETTINGS = ("stop", "go", "jump", "value", "velocity", "late")
+"""What `PhaseBank` keeps in one tensor."""
+IDLE = 0.1
+"""Chance that a person stands still at first."""
+MOST_STEPS = 40
+"""Of the bank at once, after a silence: longer ones tell no more."""
+LEAST_COUNT = 0.02
+"""What a sample of a person who stands still counts at least."""
+FIRST, DUE, NEARLY = 0.9996, 0.9995, 0.0002
+"""Of a period: on the clock at the start, when a step is due, and by how much rounded sums of times may be short."""
+SHORTEST = 1e-3
+"""s, between two values that have a velocity."""
+FLOOR = 0.02
+"""Deviation of the phase, beside those of ensemble and bank, within which the two agree."""
+ANEW = 0.2
+"""Phases by which an ensemble was wrong when all is forgotten that it has learned; of less a part is."""
+HELD = 0.4, 0.8
+"""Probability of standing still from which on the ensemble's clock is held, and from which on altogether: it would be
+behind if it were held a little all the time."""
+AGREE, DIFFER = 1.0, 3.0
+"""Deviations apart up to which the ensemble is believed, and from which on the bank."""
+
+
+class PhaseBank(Pace):
+    """Probabilities p of (mode, demonstration j, phase f), from one period to the next:
+
+    - of those that go a share 1 - exp(-stop t) stands still, of those that stand 1 - exp(-go t) goes on;
+    - who goes is ahead by r v_j t, v_j the demonstration's phase velocity, r one of `RATES`;
+    - a share 1 - exp(-jump t) is anywhere, half of it where an interaction begins;
+    - all are weighed by exp(-1/2 sum_s (value min(d_s, cap) + velocity min(e_s, cap))) over sensors s, where d_s is
+      the mean over DoFs of (x - f_j)^2 / q and e_s that of (u - r f'_j v_j)^2 / q', with the r between the least and
+      the largest of `RATES` that fits best; of who stands that of u^2 / q'. x, u are values and velocities of late.
+
+    q and q' are mean squared distances of a demonstration from the nearest other one, and what noise adds, see
+    `Likeness`. A sensor that lies counts ``cap`` at most, for all hypotheses alike.
+
+    Where the bank's phase is more than `AGREE` deviations from the ensemble's, the ensemble is led towards it.
+
+    Args:
+        likeness: what is compared.
+        pace: [N], v_j, 1/s.
+        which: int64 [N], which of the prior's states they are.
+        n_dofs: D, of the layout.
+        stop: times a second that a person stops.
+        go: times a second that one who stands goes on.
+        jump: times a second that a person starts over, or is somewhere else.
+        value, velocity: what a period's values and velocities of a sensor count; samples of one person err alike.
+        late: chance that a person was under way before anybody looked: anywhere.
+        period: s, between steps of the bank.
+
+    Raises:
+        ValueError: rates that are not positive, a chance that is not between 0 and 1.
+    """
+
+    settings: Tensor
+    which: Tensor
+    columns: Tensor
+    transition: Tensor
+
+    def __init__(
+        self,
+        likeness: Likeness,
+        pace: Tensor,
+        which: Tensor,
+        n_dofs: int,
+        stop: float = 0.3,
+        go: float = 1.0,
+        jump: float = 0.02,
+        value: float = 0.3,
+        velocity: float = 1.0,
+        late: float = 0.03,
+        period: float = 0.05,
+    ) -> None:
+        super().__init__()
+        numbers = dict(zip(SETTINGS, (stop, go, jump, value, velocity, late), strict=True))
+        for name, number in numbers.items():
+            as_number(name, number, 0, above=True)
+        if not late < 1:
+            raise ValueError(f"late must lie between 0 and 1, got {late}")
+        self.period = as_number("period", period, 0, above=True, of="of seconds")
+        self.likeness = likeness
+        self.register_buffer("settings", pace.new_tensor(list(numbers.values())))
+        self.register_buffer("which", owned(which), persistent=False)
+        self.n_dofs = n_dofs
+        self.register_buffer("columns", torch.arange(n_dofs, device=pace.device), persistent=False)
+        moves = transition_of(pace, likeness.n_phases, self.period)
+        self.register_buffer("transition", moves, persistent=False)
+        self._settled: tuple[Tensor, int, Moves] | None = None
+
+    @classmethod
+    def of(cls, primitive: InteractionPrimitive, phases: int = 25, most: int = 40, **settings: float) -> PhaseBank:
+        """The bank of a primitive's demonstrations, compared by all that is not controlled.
+
+        Args:
+            primitive: of the demonstrations.
+            phases: P, of the grid.
+            most: N at most, of demonstrations: those that differ most.
+            settings: see `PhaseBank`.
+        """
+        likeness, which = likeness_of(primitive, as_count("phases", phases, 2), as_count("most", most, 1))
+        return cls(likeness, primitive.phase_velocity[which], which, primitive.layout.n_dofs, **settings)
+
+    def check(self, model: StateSpace) -> None:
+        """See `Part.check`: it is for as many DoFs as the model has."""
+        if len(self.columns) != model.n_dofs:
+            raise ValueError(f"the phase bank is of {len(self.columns)} DoFs, the model has {model.n_dofs}")
+
+    def select(self, view: View) -> PhaseBank:
+        """See `Part.select`."""
+        part = sharing(self)
+        part.register_buffer("columns", self.columns[view.dofs], persistent=False)
+        return part
+
+    def start(self, members: Tensor, origin: Tensor | None) -> Whereabouts:
+        """See `Pace.start`: hypotheses are the demonstrations of the ensemble."""
+        batch, N = members.shape[:-2], len(self.which)
+        own = members.new_ones(*batch, N)
+        if origin is not None:
+            count = 1 + max(int(self.which.max()), int(origin.max()))
+            there = members.new_zeros(*batch, count).scatter(-1, origin.expand(*batch, -1), 1.0)
+            own = there.index_select(-1, self.which)
+            own = torch.where(own.any(-1, keepdim=True), own, 1.0)  # none of the bank's: then all
+        own = own / own.sum(-1, keepdim=True)
+        late = self.settings[5]
+        none = members.new_zeros(batch)
+        sums = members.new_zeros(*batch, 3, self.n_dofs)
+        anywhere = 0.5 * (self._begin(own, late * 0) + self._begin(own, late * 0 + 1))
+        # The first sample is due at once, and nobody has moved by then.
+        return Whereabouts(self._begin(own, late), anywhere, sums, sums, none + IDLE, none + FIRST * self.period)
+
+    def _begin(self, own: Tensor, late: Tensor) -> Tensor:
+        """[..., N, 2 P], where those of demonstrations [..., N] begin: at phase 0, a share of them anywhere."""
+        P = self.likeness.n_phases
+        place = (late / P).expand(P)
+        place = torch.cat([place[:1] + 1 - late, place[1:]])
+        return own.unsqueeze(-1) * torch.cat([(1 - IDLE) * place, IDLE * place])
+
+    def elapse(self, memory: Whereabouts, dt: Tensor) -> tuple[Whereabouts, Tensor]:
+        """See `Pace.elapse`."""
+        gone = dt
+        if bool((memory.standing > HELD[0]).any()):
+            gone = dt * (1 - self.held(memory))
+        return memory._replace(clock=memory.clock + dt), gone
+
+    def waits(self, memory: Whereabouts) -> Waits:
+        """For how long a person who stands still will."""
+        return Waits(self.held(memory), self.settings[1])
+
+    def held(self, memory: Whereabouts) -> Tensor:
+        """[...], in [0, 1], how far a person is believed to stand still: the ensemble's clock is held by as much."""
+        rate, usual = self._moves().slowness
+        standing = usual + (memory.standing - usual) * torch.exp(-rate * memory.clock)
+        held: Tensor = ((standing - HELD[0]) / (HELD[1] - HELD[0])).clamp(0, 1)
+        return held
+
+    def counts(self, memory: Whereabouts) -> Tensor | None:
+        """See `Pace.counts`."""
+        if not bool((memory.standing > HELD[0]).any()):
+            return None
+        return (1 - self.held(memory)).clamp(min=LEAST_COUNT)
+
+    def notice(self, memory: Whereabouts, seen: Seen) -> tuple[Whereabouts, Placement | None]:
+        """See `Pace.notice`."""
+        kept = memory._replace(sums=self._summed(memory, seen))
+        some = memory.clock >= DUE * self.period
+        if seen.observed is not None:
+            some = some & seen.observed.any(-1)
+        if not bool(some.any()):
+            return kept, None
+        steps = (memory.clock / self.period + NEARLY).floor()
+        share = self._passed(memory, steps) * self._weight(kept)
+        share = share / share.sum((-2, -1), keepdim=True)
+        moments = share.sum(-2) @ self._moves().moments
+        clock = torch.where(steps > 0, memory.clock - steps * self.period, 0)
+        stepped = Whereabouts(share, memory.anywhere, memory.sums * 0, closed(kept, clock), moments[..., 2], clock)
+        if not bool(some.all()):
+            stepped = Whereabouts(*(chosen(some, new, old) for new, old in zip(stepped, kept, strict=True)))
+        return stepped, self._placement(moments, some, seen)
+
+    def _summed(self, memory: Whereabouts, seen: Seen) -> Tensor:
+        """Sums [..., 3, D] with a sample."""
+        columns = self.columns if seen.rows is None else self.columns[seen.rows]
+        value, sums = seen.y, memory.sums
+        one = torch.ones_like(value)
+        if seen.observed is not None:
+            value, one = torch.where(seen.observed, value, 0), seen.observed.to(value)
+        added = torch.stack([one, one * memory.clock.unsqueeze(-1), value], -2)
+        return sums.index_add(-1, columns, added.expand(*sums.shape[:-1], added.shape[-1]))
+
+    def _passed(self, memory: Whereabouts, steps: Tensor) -> Tensor:
+        """Shares [..., N, 2 P] after so many steps [...]."""
+        passes, leap = self._moves()[:2]
+        share, N = memory.share, len(self.which)
+        most = min(int(steps.max()), MOST_STEPS)
+        alike = bool((steps == most).all())
+        for k in range(most):
+            flat = share.reshape(-1, N, share.shape[-1]).transpose(0, 1)
+            after = torch.bmm(flat, passes).transpose(0, 1).reshape(share.shape)
+            after = torch.addcmul(after, leap, memory.anywhere)
+            share = after if alike else torch.where((k < steps)[..., None, None], after, share)
+        return share
+
+    def _weight(self, memory: Whereabouts) -> Tensor:
+        """[..., N, 2 P], what each hypothesis makes of the samples that a memory holds; the best has 1."""
+        like, D = self.likeness, self.n_dofs
+        batch = memory.clock.shape
+        both = torch.cat([memory.sums, memory.before], -2).view(-1, 6, D)
+        placed = both.index_select(-1, like.order.flatten()).view(-1, 6, *like.order.shape)
+        number, time, value, former, older, before = placed.unbind(1)
+        there, number = number.clamp(max=1), number.clamp(min=1)
+        value, gap = value / number, time / number + older
+        moves = there * former * (gap > SHORTEST)
+        velocity = moves * (value - before) / gap.clamp(min=SHORTEST)
+        log = like(there * (value - like.middle), velocity, torch.stack([there, moves]), self.settings[3:5])
+        return torch.exp(log - log.amax((-2, -1), keepdim=True)).view(*batch, *log.shape[-2:])
+
+    def belief(self, memory: Whereabouts) -> tuple[Tensor, Tensor]:
+        """Mean and deviation of the phase, [...] each, by what the bank remembers."""
+        return self._belief(memory.share.sum(-2) @ self._moves().moments)
+
+    def _belief(self, moments: Tensor) -> tuple[Tensor, Tensor]:
+        """See `belief`, of moments [..., 3]."""
+        mean, square = moments[..., 0], moments[..., 1]
+        return mean, (square - mean.square()).clamp(min=(0.5 / (self.likeness.n_phases - 1)) ** 2).sqrt()
+
+    def _placement(self, moments: Tensor, some: Tensor, seen: Seen) -> Placement | None:
+        """Where members are led, of those entries of a batch of which there is ``some`` news, bool [...]."""
+        mean, deviation = self._belief(moments)
+        spread = seen.moving[..., 0].var(-1, correction=0).sqrt()
+        apart = mean - seen.mean[..., 0]
+        far = apart.abs() / (deviation.square() + spread.square() + FLOOR**2).sqrt()
+        share = ((far - AGREE) / (DIFFER - AGREE)).clamp(0, 1) * some
+        if not bool((share > 0).any()):
+            return None
+        wider = (deviation / spread.clamp(min=1e-6)).clamp(min=1)
+        return Placement(share * apart, 1 + share * (wider - 1), share * (apart.abs() / ANEW).clamp(max=1))
+
+    def _moves(self) -> Moves:
+        """What depends on the settings alone, kept while they stay as they are."""
+        settings, known = self.settings, self._settled
+        version = -1 if settings.is_inference() else settings._version
+        if known is None or version < 0 or known[0] is not settings or known[1] != version:
+            made = moves_of(settings[:3], self.transition, self.likeness.phases, self.period)
+            self._settled = known = settings, version, made
+        return known[2]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Copies and pickles have nothing kept."""
+        return {**self.__dict__, "_settled": None}
+
+    def named_values(self, layout: Layout) -> dict[str, float]:
+        """See `Part.named_values`: ``pace/...``."""
+        return {f"pace/{name}": value for name, value in zip(SETTINGS, self.settings.tolist(), strict=True)}
+
+    def extra_repr(self) -> str:
+        """Sizes."""
+        return f"{len(self.which)} demonstrations, {self.likeness.n_phases} phases, every {self.period:g} s"
+
+    def meant(self) -> str:
+        """What its tensors mean, see `Meaning`."""
+        return f"period={self.period:g}"
