@@ -116,9 +116,9 @@ def numpy_bank(values: np.ndarray, times: np.ndarray, bank: PhaseBank) -> list[n
                     still.append(sum(u[d] ** 2 / q_velocity[d] for d in some) / n)
                 rate = np.clip(sum(along) / max(sum(square), 1e-300), RATES[0], RATES[-1])
                 moved = [c - 2 * rate * a + rate**2 * b for a, b, c in zip(along, square, still, strict=True)]
-                where = by_value * sum(min(each, CAP) for each in near)
+                where = bank.period * by_value * sum(min(each, CAP) for each in near)
                 for mode, misfits in enumerate((moved, still)):
-                    total = where + by_velocity * sum(min(each, CAP) for each in misfits)
+                    total = where + bank.period * by_velocity * sum(min(each, CAP) for each in misfits)
                     share[mode, j, p] *= math.exp(-0.5 * total)
         share = share / share.sum()
         told.append(share.copy())

@@ -29,6 +29,8 @@ from torch_ebip.recordings.layout import Layout
 
 SETTINGS = ("stop", "go", "jump", "value", "velocity", "late")
 """What `PhaseBank` keeps in one tensor."""
+LONGEST, STEPS = 0.1, 25
+"""s, of a period, and how many an interaction has at least."""
 IDLE = 0.1
 """Chance that a person stands still at first."""
 MOST_STEPS = 40
@@ -56,7 +58,7 @@ class PhaseBank(Pace):
     - of those that go a share 1 - exp(-stop t) stands still, of those that stand 1 - exp(-go t) goes on;
     - who goes is ahead by r v_j t, v_j the demonstration's phase velocity, r one of `RATES`;
     - a share 1 - exp(-jump t) is anywhere, half of it where an interaction begins;
-    - all are weighed by exp(-1/2 sum_s (value min(d_s, cap) + velocity min(e_s, cap))) over sensors s, where d_s is
+    - all are weighed by exp(-t/2 sum_s (value min(d_s, cap) + velocity min(e_s, cap))) over sensors s, where d_s is
       the mean over DoFs of (x - f_j)^2 / q and e_s that of (u - r f'_j v_j)^2 / q', with the r between the least and
       the largest of `RATES` that fits best; of who stands that of u^2 / q'. x, u are values and velocities of late.
 
@@ -73,7 +75,7 @@ class PhaseBank(Pace):
         stop: times a second that a person stops.
         go: times a second that one who stands goes on.
         jump: times a second that a person starts over, or is somewhere else.
-        value, velocity: what a period's values and velocities of a sensor count; samples of one person err alike.
+        value, velocity: times a second that values and velocities of a sensor count; samples of one person err alike.
         late: chance that a person was under way before anybody looked: anywhere.
         period: s, between steps of the bank.
 
@@ -95,10 +97,10 @@ class PhaseBank(Pace):
         stop: float = 0.3,
         go: float = 1.0,
         jump: float = 0.02,
-        value: float = 0.3,
-        velocity: float = 1.0,
+        value: float = 5.0,
+        velocity: float = 15.0,
         late: float = 0.03,
-        period: float = 0.05,
+        period: float = 0.1,
     ) -> None:
         super().__init__()
         numbers = dict(zip(SETTINGS, (stop, go, jump, value, velocity, late), strict=True))
@@ -124,9 +126,11 @@ class PhaseBank(Pace):
             primitive: of the demonstrations.
             phases: P, of the grid.
             most: N at most, of demonstrations: those that differ most.
-            settings: see `PhaseBank`.
+            settings: see `PhaseBank`; the period is `LONGEST` at most, and one of `STEPS` of an interaction.
         """
         likeness, which = likeness_of(primitive, as_count("phases", phases, 2), as_count("most", most, 1))
+        usual = 1 / float(primitive.phase_velocity.mean())
+        settings = {"period": min(LONGEST, usual / STEPS), **settings}
         return cls(likeness, primitive.phase_velocity[which], which, primitive.layout.n_dofs, **settings)
 
     def check(self, model: StateSpace) -> None:
@@ -240,7 +244,8 @@ class PhaseBank(Pace):
         value, gap = value / number, time / number + older
         moves = there * former * (gap > SHORTEST)
         velocity = moves * (value - before) / gap.clamp(min=SHORTEST)
-        log = like(there * (value - like.middle), velocity, torch.stack([there, moves]), self.settings[3:5])
+        strength = self.period * self.settings[3:5]
+        log = like(there * (value - like.middle), velocity, torch.stack([there, moves]), strength)
         return torch.exp(log - log.amax((-2, -1), keepdim=True)).view(*batch, *log.shape[-2:])
 
     def belief(self, memory: Whereabouts) -> tuple[Tensor, Tensor]:
