@@ -276,7 +276,7 @@ def test_foreign_cut_off_and_later_files_are_named(tmp_path: Path) -> None:
     flipped = bytearray(content)
     flipped[-100] ^= 1
     (tmp_path / "flipped").write_bytes(bytes(flipped))
-    (tmp_path / "later").write_bytes(content.replace(b'"version":"6"', b'"version":"7"'))
+    (tmp_path / "later").write_bytes(content.replace(b'"version":"7"', b'"version":"8"'))
     messages = {
         "foreign": "tensors of something else",
         "cut": "cut off or damaged",
@@ -311,4 +311,4 @@ def test_a_description_of_something_else_is_refused_though_its_sum_is_right(tmp_
         write_model_file(path, {**description, key: value}, tensors)
         with pytest.raises(ValueError, match="m: a model whose parts do not fit together"):
             load_model(path)
-    assert (KIND, VERSION) == ("torch_ebip model", 6)
+    assert (KIND, VERSION) == ("torch_ebip model", 7)

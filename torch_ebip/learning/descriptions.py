@@ -39,6 +39,7 @@ from torch_ebip.interaction.presets import ebip
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.interaction.recognition import PHASES, Recognition
 from torch_ebip.learning.caution import describe_caution, give_caution
+from torch_ebip.learning.pacing import describe_pace, pace_of
 from torch_ebip.learning.readout_descriptions import describe_readout, readout_of
 from torch_ebip.recordings.layout import Layout, Modality
 
@@ -140,6 +141,7 @@ def describe_filter(filter: InteractionFilter, primitive: InteractionPrimitive) 
         "readout": describe_readout(filter.readout),
         "recent": None if update.recent is None else list(update.recent.windows),
         "recognition": filter.recognition is not None and len(filter.recognition.sharpness) > 0,
+        "pace": describe_pace(filter),
         **describe_caution(filter),
     }
     again = build_filter(primitive, description)
@@ -186,6 +188,7 @@ def build_filter(primitive: InteractionPrimitive, description: Description) -> I
             windows = description["recent"]
             windows = windows if isinstance(windows, list) else [windows]  # before version 6: one
             filter.analysis.recent = recent_of(primitive, float(windows[0]), [float(w) for w in windows[1:]])
+        filter.analysis.pace = pace_of(primitive, description.get("pace"))  # files before version 7 know of none
         give_caution(filter, primitive, description)
         return filter
     except (AttributeError, ArithmeticError, LookupError, TypeError, ValueError) as error:

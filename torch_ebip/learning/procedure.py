@@ -28,6 +28,7 @@ from torch_ebip.learning.interaction_model import NAME, InteractionModel
 from torch_ebip.learning.losses import ForwardKinematicsLoss
 from torch_ebip.learning.monitor import Monitor
 from torch_ebip.learning.objective import objective_for
+from torch_ebip.learning.pacing import learn_pace
 from torch_ebip.learning.partition import generator_of
 from torch_ebip.learning.place import enter, fingerprint
 from torch_ebip.learning.progress import Reporter
@@ -42,7 +43,7 @@ from torch_ebip.learning.starts import FACTORS, TRIES, Start, best_factor, best_
 from torch_ebip.learning.tuner import Tuner
 from torch_ebip.recordings.demonstrations import Demonstrations
 
-PROCEDURE = 5  # what another edition of this file began in a folder is not gone on with
+PROCEDURE = 6  # what another edition of this file began in a folder is not gone on with
 FEWEST = 10
 """Demonstrations below which there is no gradient: those kept for validation would say nothing."""
 DECIDING, MOST = 200, 100
@@ -65,6 +66,7 @@ class Procedure:
     shrink: bool
     analogues: bool
     expert: bool
+    pace: bool
     ahead: tuple[float, ...]
     memories: int
     chances: dict[str, float]
@@ -95,8 +97,7 @@ class Procedure:
         self.known, self.remarks = labelled(self.known, primitive, self.settings.seed, self.ranks)
         labels = primitive.labels = self.known.labels
         self.groups = {} if labels is None or labels == given else {label: labels.count(label) for label in labels}
-        ahead = self._horizons()
-        objective = objective_for(primitive, targets, self.targets, ahead, arm, joints)
+        objective = objective_for(primitive, targets, self.targets, self._horizons(), arm, joints)
         masks = {name: layout.mask(names).to(targets.device) for name, names in self.subsets.items()}
         self.task = Task(primitive, objective, targets, masks)
         self.held_out = HeldOut(self.known, self.task, self.settings, self.ranks)
@@ -105,11 +106,9 @@ class Procedure:
     def _horizons(self) -> list[float]:
         """The horizons that enough demonstrations reach; of the others the report says so."""
         there = reached(self.primitive, self.ahead)
-        short = [horizon_name(a) for a in self.ahead if a not in there]
+        short = ", ".join(horizon_name(a) for a in self.ahead if a not in there)
         if short:
-            self.remarks.append(
-                f"not scored, because hardly any demonstration goes on for so long: {', '.join(short)}"
-            )
+            self.remarks.append(f"not scored, because hardly any demonstration goes on for so long: {short}")
         return there
 
     def enter(self, place: Path) -> InteractionModel | None:
@@ -135,6 +134,7 @@ class Procedure:
             "shrink": self.shrink,
             "analogues": self.analogues,
             "expert": self.expert,
+            "pace": self.pace,
             "ahead": [horizon_name(a) for a in self.ahead],
             "memories": self.memories,
             "chances": self.chances,
@@ -165,12 +165,12 @@ class Procedure:
         interrupted |= self.said.get("interrupted_at") is not None
         names = [name for name in self.filters if self.known.labels is None or name in WEIGHING] or list(self.filters)
         chosen = min(names, key=lambda name: self.scores[name]["remaining"])
-        drawn = None
+        drawn, filter = None, self.filters[chosen]
         if not interrupted:
             try:
-                drawn = self._draw(self.filters[chosen])
-                self._recognise(self.filters[chosen])
-                self._doubt(self.filters[chosen])
+                drawn = self._draw(filter)
+                self._recognise(filter)
+                self._doubt(filter)
             except KeyboardInterrupt:
                 interrupted = True
         return self._finish(chosen, drawn, interrupted)
@@ -256,22 +256,23 @@ class Procedure:
             filter.recognition, self.said["recognition"] = learn_recognition(self.held_out, filter, labels, order)
 
     def _doubt(self, filter: InteractionEnsembleFilter) -> None:
-        """What would surprise the filter, and what it then says."""
+        """What would surprise the filter, and what it then says; whether people may pause."""
         self.reporter.stage("surprise")
         self.said["surprise"], remarks = learn_caution(self.held_out, self.known, filter, self.chances)
         self.remarks.extend(remarks)
         if not remarks and self.monitor is not None:
             self.monitor.values("surprise", familiar(self.held_out, filter, self.scored))
+        if self.pace and len(self.known) >= FEWEST:
+            self.said["pace"] = learn_pace(self.held_out, self.known, filter)
         self.reporter.tick()
 
     def _finish(self, chosen: str, drawn: Drawn | None, interrupted: bool) -> InteractionModel:
         """Report and keep."""
         filter = self.filters[chosen]
         reason = None
-        if interrupted:
-            reason = "interrupted, this is the best so far"
-        elif self.steps and not self.tunes:
+        if self.steps and not self.tunes:
             reason = f"no gradient: {len(self.known)} demonstrations are too few to tell when to stop"
+        reason = "interrupted, this is the best so far" if interrupted else reason
         gain = None if drawn is None else drawn.gain if self.shrink else drawn.gain_alone
         stages = {name: self.scores[name] for name in STAGES if name in self.scores}
         report = Report(

@@ -48,6 +48,7 @@ def learn(
     shrink: bool = True,
     analogues: bool = True,
     expert: bool = True,
+    pace: bool = True,
     ahead: Sequence[float] = AHEAD,
     memories: int = 2,
     scan: int = 48,
@@ -84,6 +85,7 @@ def learn(
         analogues: whether they may be put together with those of analogues, where that is better; see
             `AnalogueReadout`.
         expert: whether a recurrent network may be heard beside analogues, where that is better; see `Expert`.
+        pace: whether people may pause, start late or start over, where a `PhaseBank` makes that better.
         ahead: horizons that count alike, in s, increasing; the last is infinity, the end.
         memories: of the evidence: 2, a fast and a slow one, or the fast one alone.
         scan: how many interactions decide where the gradient starts.
@@ -149,6 +151,7 @@ def learn(
         shrink,
         analogues,
         expert,
+        pace,
         ahead,
         memories,
         chances,

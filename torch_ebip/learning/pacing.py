@@ -1,0 +1,130 @@
+"""Whether a filter follows the phase by a bank of hypotheses, too, and how sharply that looks: by validation.
+
+Nobody demonstrates how they are interrupted. So interactions left out are interrupted here, and a bank is taken if
+it makes forecasts of those better and of what goes on undisturbed hardly worse.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_ebip.common.ambient import without_autocast
+from torch_ebip.filtering.functional.scores import gaussian_crps
+from torch_ebip.interaction.filter_kinds import InteractionEnsembleFilter
+from torch_ebip.interaction.filters import InteractionFilter
+from torch_ebip.interaction.pace.phase_bank import PhaseBank
+from torch_ebip.interaction.primitive import InteractionPrimitive
+from torch_ebip.learning.held_out import HeldOut
+from torch_ebip.learning.interruptions import again, idle, interrupted, late, pause
+from torch_ebip.learning.partition import generator_of
+from torch_ebip.recordings.demonstrations import Demonstrations
+
+KINDS = [pause(0.2, 3.0), idle(0.5, 3.0), late(0.2, 0.6), again(0.2, 0.6)]
+"""Of interruptions, in turn."""
+SHARPNESS = (0.5, 1.0, 2.0)
+"""That are tried, as multiples of what a bank's distances count at first."""
+COSTS = 0.01
+"""Share by which forecasts of undisturbed interactions may get worse."""
+MOST, FEWEST = 48, 8
+"""Interactions that decide, at most in all and at least of each set of sensors."""
+SHARES = (0.3, 0.5, 0.7, 0.9)
+"""Of recordings, up to which they are shown."""
+
+
+@without_autocast
+@torch.no_grad()
+def learn_pace(
+    held_out: HeldOut, demonstrations: Demonstrations, filter: InteractionEnsembleFilter
+) -> dict[str, Any]:
+    """Give a filter a `PhaseBank`, where that is better, and say what it gave.
+
+    Args:
+        held_out: of the demonstrations.
+        demonstrations: N of them.
+        filter: with everything else that it has.
+
+    Returns:
+        ``used``, ``sharpness``, and the CRPS over all horizons and DoFs, in units of the targets' spread, ``with``
+        and ``without`` it, of interactions ``undisturbed`` and ``interrupted``.
+    """
+    task = held_out.task
+    primitive = task.primitive
+    # As on the robot: a step of the bank is a tenth of a second, and tuning thins more than that.
+    settings = replace(held_out.settings, thinning=1)
+    noise = primitive.residual_variance.sqrt().cpu()
+    draws = generator_of(held_out.settings.seed, -5)
+    disturbed = [made.values for made in interrupted(demonstrations, KINDS, noise, draws)]
+    both = {
+        "undisturbed": HeldOut(demonstrations, task, settings, held_out.ranks),
+        "interrupted": HeldOut(
+            Demonstrations(demonstrations.layout, disturbed, demonstrations.rate), task, settings, held_out.ranks
+        ),
+    }
+    order = torch.randperm(len(demonstrations), generator=draws, device="cpu")
+
+    def scores() -> dict[str, float]:
+        """Of the filter as it is."""
+        return {name: _crps(each, filter, order) for name, each in both.items()}
+
+    without = scores()
+    tried: dict[float, dict[str, float]] = {}
+    banks = {sharpness: _bank(primitive, sharpness) for sharpness in SHARPNESS}
+    for sharpness, bank in banks.items():
+        filter.analysis.pace = bank
+        tried[sharpness] = scores()
+    fair = [s for s, each in tried.items() if each["undisturbed"] <= (1 + COSTS) * without["undisturbed"]]
+    best = min(fair or tried, key=lambda sharpness: tried[sharpness]["interrupted"])
+    used = bool(fair) and tried[best]["interrupted"] < without["interrupted"]
+    filter.analysis.pace = banks[best] if used else None
+    told: dict[str, Any] = {"used": used, "sharpness": best}
+    for name, values in (("with", tried[best]), ("without", without)):
+        told[name] = {kind: round(value, 5) for kind, value in values.items()}
+    return told
+
+
+def _bank(primitive: InteractionPrimitive, sharpness: float) -> PhaseBank:
+    """A bank whose distances count so many times what they do at first."""
+    bank = PhaseBank.of(primitive)
+    bank.settings[3:5] *= sharpness  # of values and velocities
+    return bank
+
+
+def _crps(held_out: HeldOut, filter: InteractionFilter, order: Tensor) -> float:
+    """CRPS of forecasts over all horizons and DoFs, units of the targets' spread, of some interactions int64 [N]."""
+    task = held_out.task
+    each = max(FEWEST, MOST // len(task.subsets))
+    shares = torch.tensor(SHARES, device="cpu")
+    total = count = 0.0
+    for i, subset in enumerate(task.subsets.values()):
+        some = order.roll(-i * each)[:each]
+        for trial in held_out.trials(filter, some, subset, shares):
+            forecast, truth = trial.forecast(task.objective), trial.shown.truth
+            measured = ~truth.isnan()
+            scale = task.objective.scale.expand_as(truth)
+            found = gaussian_crps(forecast.mean, forecast.variance, torch.where(measured, truth, 0)) / scale
+            total += float(found[measured].double().sum())
+            count += float(measured.sum())
+    parts = held_out.ranks.gather([torch.tensor([total, count], dtype=torch.float64, device="cpu")])
+    sums = torch.stack([part for share in parts for part in share]).sum(0)
+    return float(sums[0] / sums[1])
+
+
+def describe_pace(filter: InteractionFilter) -> dict[str, Any] | None:
+    """The sizes of a filter's bank in plain values, None where it has none; its settings are among its numbers."""
+    pace = filter.pace
+    if pace is None:
+        return None
+    return {"phases": pace.likeness.n_phases, "most": len(pace.which), "period": pace.period}
+
+
+def pace_of(primitive: InteractionPrimitive, description: Mapping[str, Any] | None) -> PhaseBank | None:
+    """The bank of a primitive that `describe_pace` described; its settings are still to be filled in."""
+    if description is None:
+        return None
+    phases, most = int(description["phases"]), int(description["most"])
+    return PhaseBank.of(primitive, phases, most, period=float(description["period"]))
