@@ -81,8 +81,8 @@ class Job:
 
 Answers = list[dict[str, Any]]
 """One of each method, interaction, kind and moment: ``error`` (mean over DoFs of the absolute error at the end, unit
-of the target), ``usual`` (that of the same method when as much was seen of the same person, undisturbed), ``squared``,
-``far`` (share of DoFs further off than `FAR` deviations), ``deviation`` (their median),
+of the target), ``usual`` (that of the same method when as much was seen of the same person, undisturbed),
+``squared``, ``far`` (share of DoFs further off than `FAR` deviations), ``deviation`` (their median) and
 ``phase_error``."""
 
 
