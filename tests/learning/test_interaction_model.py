@@ -18,6 +18,7 @@ from torch_ebip import (
     InteractionPrimitive,
     Layout,
     Modality,
+    PhaseBank,
     PolynomialBasis,
     SigmoidBasis,
     StackedBasis,
@@ -39,6 +40,7 @@ OPTIONS = {
     "drifting": {"phase": DriftingPhase(0.7, overrun=0.1), "localise": True},
     "accelerating": {"phase": AcceleratingPhase(overrun=0.1), "square_root": True},
     "few": {"n_members": 9},
+    "paced": {"square_root": True, "weigh": True, "pace": PhaseBank.of(small_primitive(), 15, 20, stop=0.7, go=2.0)},
 }
 
 
@@ -276,14 +278,14 @@ def test_foreign_cut_off_and_later_files_are_named(tmp_path: Path) -> None:
     flipped = bytearray(content)
     flipped[-100] ^= 1
     (tmp_path / "flipped").write_bytes(bytes(flipped))
-    (tmp_path / "later").write_bytes(content.replace(b'"version":"7"', b'"version":"8"'))
+    (tmp_path / "later").write_bytes(content.replace(b'"version":"%d"' % VERSION, b'"version":"%d"' % (VERSION + 1)))
     messages = {
         "foreign": "tensors of something else",
         "cut": "cut off or damaged",
         "head": "cut off in its header",
         "pickle": "not a model",
         "flipped": "damaged model",
-        "later": "model format '7', this torch_ebip reads up to 6",
+        "later": f"model format '{VERSION + 1}', this torch_ebip reads up to {VERSION}",
     }
     for name, message in messages.items():
         with pytest.raises(ValueError, match=f"{name}: .*{message}"):

@@ -26,8 +26,8 @@ from torch_ebip.recordings.demonstrations import Demonstrations
 
 KINDS = [pause(0.2, 3.0), idle(0.5, 3.0), late(0.2, 0.6), again(0.2, 0.6)]
 """Of interruptions, in turn."""
-SHARPNESS = (0.5, 1.0, 2.0)
-"""That are tried, as multiples of what a bank's distances count at first."""
+TRIED = ((1.0, 1.0), (1.0, 2.0), (1.0, 3.0), (2.0, 2.0), (2.0, 3.0))
+"""What distances count, as multiples of what they do at first, and by how many deviations phases may differ."""
 COSTS = 0.01
 """Share by which forecasts of undisturbed interactions may get worse."""
 MOST, FEWEST = 48, 8
@@ -49,20 +49,20 @@ def learn_pace(
         filter: with everything else that it has.
 
     Returns:
-        ``used``, ``sharpness``, and the CRPS over all horizons and DoFs, in units of the targets' spread, ``with``
-        and ``without`` it, of interactions ``undisturbed`` and ``interrupted``.
+        ``used``, ``sharpness`` and ``agree``, and the CRPS over all horizons and DoFs, in units of the targets'
+        spread, ``with`` and ``without`` it, of interactions ``undisturbed`` and ``interrupted``.
     """
     task = held_out.task
     primitive = task.primitive
     # As on the robot: a step of the bank is a tenth of a second, and tuning thins more than that.
-    settings = replace(held_out.settings, thinning=1)
+    unthinned = replace(held_out.settings, thinning=1)
     noise = primitive.residual_variance.sqrt().cpu()
     draws = generator_of(held_out.settings.seed, -5)
     disturbed = [made.values for made in interrupted(demonstrations, KINDS, noise, draws)]
     both = {
-        "undisturbed": HeldOut(demonstrations, task, settings, held_out.ranks),
+        "undisturbed": HeldOut(demonstrations, task, unthinned, held_out.ranks),
         "interrupted": HeldOut(
-            Demonstrations(demonstrations.layout, disturbed, demonstrations.rate), task, settings, held_out.ranks
+            Demonstrations(demonstrations.layout, disturbed, demonstrations.rate), task, unthinned, held_out.ranks
         ),
     }
     order = torch.randperm(len(demonstrations), generator=draws, device="cpu")
@@ -72,24 +72,24 @@ def learn_pace(
         return {name: _crps(each, filter, order) for name, each in both.items()}
 
     without = scores()
-    tried: dict[float, dict[str, float]] = {}
-    banks = {sharpness: _bank(primitive, sharpness) for sharpness in SHARPNESS}
-    for sharpness, bank in banks.items():
+    tried: dict[tuple[float, float], dict[str, float]] = {}
+    banks = {settings: _bank(primitive, *settings) for settings in TRIED}
+    for settings, bank in banks.items():
         filter.analysis.pace = bank
-        tried[sharpness] = scores()
+        tried[settings] = scores()
     fair = [s for s, each in tried.items() if each["undisturbed"] <= (1 + COSTS) * without["undisturbed"]]
-    best = min(fair or tried, key=lambda sharpness: tried[sharpness]["interrupted"])
+    best = min(fair or tried, key=lambda settings: tried[settings]["interrupted"])
     used = bool(fair) and tried[best]["interrupted"] < without["interrupted"]
     filter.analysis.pace = banks[best] if used else None
-    told: dict[str, Any] = {"used": used, "sharpness": best}
+    told: dict[str, Any] = {"used": used, "sharpness": best[0], "agree": best[1]}
     for name, values in (("with", tried[best]), ("without", without)):
         told[name] = {kind: round(value, 5) for kind, value in values.items()}
     return told
 
 
-def _bank(primitive: InteractionPrimitive, sharpness: float) -> PhaseBank:
+def _bank(primitive: InteractionPrimitive, sharpness: float, agree: float) -> PhaseBank:
     """A bank whose distances count so many times what they do at first."""
-    bank = PhaseBank.of(primitive)
+    bank = PhaseBank.of(primitive, agree=agree)
     bank.settings[3:5] *= sharpness  # of values and velocities
     return bank
 

@@ -62,7 +62,7 @@ def numpy_bank(values: np.ndarray, times: np.ndarray, bank: PhaseBank) -> list[n
     assert order.tolist()[0] == [0, 1]
     assert order.tolist()[1][0] == 2
     q, q_velocity = (1 / np.append(each[0], each[1, 0]) for each in precision)
-    stop, go, jump, by_value, by_velocity, late = bank.settings.tolist()
+    stop, go, jump, by_value, by_velocity, late, _ = bank.settings.tolist()
     N, P, _ = f.shape
     pace = primitive.phase_velocity.numpy()
     sensors = [[0, 1], [2]]

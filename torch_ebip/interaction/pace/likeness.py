@@ -79,8 +79,9 @@ class Likeness(nn.Module):
             self.register_buffer(name, owned(tensor), persistent=False)
         self.n_demonstrations, self.n_phases = N, P
 
-    def forward(self, apart: Tensor, velocity: Tensor, known: Tensor, strength: Tensor) -> Tensor:
-        """Logarithms [R, N, 2 P] of what going and standing make of R samples, up to a constant; see `PhaseBank`.
+    def forward(self, apart: Tensor, velocity: Tensor, known: Tensor, strength: Tensor) -> tuple[Tensor, Tensor]:
+        """Logarithms [R, N, 2 P] of what going and standing make of R samples, up to a constant, see `PhaseBank`; and
+        squared distances of values alone, [R, N, P], mean over sensors, 1 for what is usual.
 
         Args:
             apart: [R, S, w], values less `middle`, units of the DoFs; 0 where there are none.
@@ -105,7 +106,9 @@ class Likeness(nn.Module):
         going = where + torch.minimum(moved, caps[1]).sum(0)
         standing = where + torch.minimum(own[1], caps[1]).sum(0)
         shape = R, self.n_demonstrations, self.n_phases
-        return -0.5 * torch.cat([going.view(shape), standing.view(shape)], -1)
+        log = -0.5 * torch.cat([going.view(shape), standing.view(shape)], -1)
+        sensors = shares[0].any(-1).sum(-1).clamp(min=1)  # [R], that say something
+        return log, (where / strength[0]).view(shape) / sensors[:, None, None]
 
     def extra_repr(self) -> str:
         """Sizes."""

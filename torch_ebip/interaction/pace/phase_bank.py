@@ -27,7 +27,7 @@ from torch_ebip.interaction.pace.whereabouts import Whereabouts, chosen, closed
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.recordings.layout import Layout
 
-SETTINGS = ("stop", "go", "jump", "value", "velocity", "late")
+SETTINGS = ("stop", "go", "jump", "value", "velocity", "late", "agree")
 """What `PhaseBank` keeps in one tensor."""
 LONGEST, STEPS = 0.1, 25
 """s, of a period, and how many an interaction has at least."""
@@ -43,13 +43,16 @@ SHORTEST = 1e-3
 """s, between two values that have a velocity."""
 FLOOR = 0.02
 """Deviation of the phase, beside those of ensemble and bank, within which the two agree."""
+STRANGE = 3.0, 6.0
+"""Squared distance from what was demonstrated, 1 for what is usual, up to which a bank knows where a person is, and
+from which on it does not: who moves as nobody did is followed by the ensemble alone."""
 ANEW = 0.2
 """Phases by which an ensemble was wrong when all is forgotten that it has learned; of less a part is."""
 HELD = 0.4, 0.8
 """Probability of standing still from which on the ensemble's clock is held, and from which on altogether: it would be
 behind if it were held a little all the time."""
-AGREE, DIFFER = 1.0, 3.0
-"""Deviations apart up to which the ensemble is believed, and from which on the bank."""
+DIFFER = 2.0
+"""Deviations beyond those up to which the ensemble is believed, from which on the bank is."""
 
 
 class PhaseBank(Pace):
@@ -65,7 +68,7 @@ class PhaseBank(Pace):
     q and q' are mean squared distances of a demonstration from the nearest other one, and what noise adds, see
     `Likeness`. A sensor that lies counts ``cap`` at most, for all hypotheses alike.
 
-    Where the bank's phase is more than `AGREE` deviations from the ensemble's, the ensemble is led towards it.
+    Where the bank's phase is more than ``agree`` deviations from the ensemble's, the ensemble is led towards it.
 
     Args:
         likeness: what is compared.
@@ -77,6 +80,7 @@ class PhaseBank(Pace):
         jump: times a second that a person starts over, or is somewhere else.
         value, velocity: times a second that values and velocities of a sensor count; samples of one person err alike.
         late: chance that a person was under way before anybody looked: anywhere.
+        agree: deviations by which the phases of bank and ensemble may differ.
         period: s, between steps of the bank.
 
     Raises:
@@ -100,10 +104,11 @@ class PhaseBank(Pace):
         value: float = 5.0,
         velocity: float = 15.0,
         late: float = 0.03,
+        agree: float = 1.0,
         period: float = 0.1,
     ) -> None:
         super().__init__()
-        numbers = dict(zip(SETTINGS, (stop, go, jump, value, velocity, late), strict=True))
+        numbers = dict(zip(SETTINGS, (stop, go, jump, value, velocity, late, agree), strict=True))
         for name, number in numbers.items():
             as_number(name, number, 0, above=True)
         if not late < 1:
@@ -201,14 +206,17 @@ class PhaseBank(Pace):
         if not bool(some.any()):
             return kept, None
         steps = (memory.clock / self.period + NEARLY).floor()
-        share = self._passed(memory, steps) * self._weight(kept)
+        weight, distance = self._weight(kept)
+        share = self._passed(memory, steps) * weight
         share = share / share.sum((-2, -1), keepdim=True)
         moments = share.sum(-2) @ self._moves().moments
         clock = torch.where(steps > 0, memory.clock - steps * self.period, 0)
         stepped = Whereabouts(share, memory.anywhere, memory.sums * 0, closed(kept, clock), moments[..., 2], clock)
         if not bool(some.all()):
             stepped = Whereabouts(*(chosen(some, new, old) for new, old in zip(stepped, kept, strict=True)))
-        return stepped, self._placement(moments, some, seen)
+        P = distance.shape[-1]
+        strange = ((share[..., :P] + share[..., P:]) * distance).sum((-2, -1))
+        return stepped, self._placement(moments, strange, some, seen)
 
     def _summed(self, memory: Whereabouts, seen: Seen) -> Tensor:
         """Sums [..., 3, D] with a sample."""
@@ -233,8 +241,9 @@ class PhaseBank(Pace):
             share = after if alike else torch.where((k < steps)[..., None, None], after, share)
         return share
 
-    def _weight(self, memory: Whereabouts) -> Tensor:
-        """[..., N, 2 P], what each hypothesis makes of the samples that a memory holds; the best has 1."""
+    def _weight(self, memory: Whereabouts) -> tuple[Tensor, Tensor]:
+        """[..., N, 2 P], what each hypothesis makes of the samples that a memory holds, the best has 1; and how far
+        they are from each, [..., N, P]."""
         like, D = self.likeness, self.n_dofs
         batch = memory.clock.shape
         both = torch.cat([memory.sums, memory.before], -2).view(-1, 6, D)
@@ -245,8 +254,9 @@ class PhaseBank(Pace):
         moves = there * former * (gap > SHORTEST)
         velocity = moves * (value - before) / gap.clamp(min=SHORTEST)
         strength = self.period * self.settings[3:5]
-        log = like(there * (value - like.middle), velocity, torch.stack([there, moves]), strength)
-        return torch.exp(log - log.amax((-2, -1), keepdim=True)).view(*batch, *log.shape[-2:])
+        log, distance = like(there * (value - like.middle), velocity, torch.stack([there, moves]), strength)
+        weight = torch.exp(log - log.amax((-2, -1), keepdim=True))
+        return weight.view(*batch, *log.shape[-2:]), distance.view(*batch, *distance.shape[-2:])
 
     def belief(self, memory: Whereabouts) -> tuple[Tensor, Tensor]:
         """Mean and deviation of the phase, [...] each, by what the bank remembers."""
@@ -257,13 +267,21 @@ class PhaseBank(Pace):
         mean, square = moments[..., 0], moments[..., 1]
         return mean, (square - mean.square()).clamp(min=(0.5 / (self.likeness.n_phases - 1)) ** 2).sqrt()
 
-    def _placement(self, moments: Tensor, some: Tensor, seen: Seen) -> Placement | None:
-        """Where members are led, of those entries of a batch of which there is ``some`` news, bool [...]."""
+    def _placement(self, moments: Tensor, strange: Tensor, some: Tensor, seen: Seen) -> Placement | None:
+        """Where members are led, of those entries of a batch of which there is ``some`` news, bool [...].
+
+        Args:
+            moments: [..., 3], of the phase.
+            strange: [...], squared distance from all that was demonstrated, 1 for what is usual.
+            some: bool [...].
+            seen: the sample.
+        """
         mean, deviation = self._belief(moments)
         spread = seen.moving[..., 0].var(-1, correction=0).sqrt()
         apart = mean - seen.mean[..., 0]
         far = apart.abs() / (deviation.square() + spread.square() + FLOOR**2).sqrt()
-        share = ((far - AGREE) / (DIFFER - AGREE)).clamp(0, 1) * some
+        known = ((STRANGE[1] - strange) / (STRANGE[1] - STRANGE[0])).clamp(0, 1)
+        share = ((far - self.settings[6]) / DIFFER).clamp(0, 1) * known * some
         if not bool((share > 0).any()):
             return None
         wider = (deviation / spread.clamp(min=1e-6)).clamp(min=1)
