@@ -20,6 +20,7 @@ from torch_ebip.filtering.model import StateSpace
 from torch_ebip.filtering.protocols import View
 from torch_ebip.filtering.updates.pace import Pace, Placement
 from torch_ebip.filtering.updates.weighting import Seen
+from torch_ebip.interaction.pace.leading import belief_of, placement_of
 from torch_ebip.interaction.pace.likeness import Likeness, likeness_of
 from torch_ebip.interaction.pace.moves import Moves, moves_of, transition_of
 from torch_ebip.interaction.pace.waiting import Waits
@@ -41,18 +42,9 @@ FIRST, DUE, NEARLY = 0.9996, 0.9995, 0.0002
 """Of a period: on the clock at the start, when a step is due, and by how much rounded sums of times may be short."""
 SHORTEST = 1e-3
 """s, between two values that have a velocity."""
-FLOOR = 0.02
-"""Deviation of the phase, beside those of ensemble and bank, within which the two agree."""
-STRANGE = 3.0, 6.0
-"""Squared distance from what was demonstrated, 1 for what is usual, up to which a bank knows where a person is, and
-from which on it does not: who moves as nobody did is followed by the ensemble alone."""
-ANEW = 0.2
-"""Phases by which an ensemble was wrong when all is forgotten that it has learned; of less a part is."""
 HELD = 0.4, 0.8
 """Probability of standing still from which on the ensemble's clock is held, and from which on altogether: it would be
 behind if it were held a little all the time."""
-DIFFER = 2.0
-"""Deviations beyond those up to which the ensemble is believed, from which on the bank is."""
 
 
 class PhaseBank(Pace):
@@ -216,7 +208,7 @@ class PhaseBank(Pace):
             stepped = Whereabouts(*(chosen(some, new, old) for new, old in zip(stepped, kept, strict=True)))
         P = distance.shape[-1]
         strange = ((share[..., :P] + share[..., P:]) * distance).sum((-2, -1))
-        return stepped, self._placement(moments, strange, some, seen)
+        return stepped, placement_of(belief_of(moments, self.likeness.phases), strange, some, seen, self.settings[6])
 
     def _summed(self, memory: Whereabouts, seen: Seen) -> Tensor:
         """Sums [..., 3, D] with a sample."""
@@ -260,32 +252,7 @@ class PhaseBank(Pace):
 
     def belief(self, memory: Whereabouts) -> tuple[Tensor, Tensor]:
         """Mean and deviation of the phase, [...] each, by what the bank remembers."""
-        return self._belief(memory.share.sum(-2) @ self._moves().moments)
-
-    def _belief(self, moments: Tensor) -> tuple[Tensor, Tensor]:
-        """See `belief`, of moments [..., 3]."""
-        mean, square = moments[..., 0], moments[..., 1]
-        return mean, (square - mean.square()).clamp(min=(0.5 / (self.likeness.n_phases - 1)) ** 2).sqrt()
-
-    def _placement(self, moments: Tensor, strange: Tensor, some: Tensor, seen: Seen) -> Placement | None:
-        """Where members are led, of those entries of a batch of which there is ``some`` news, bool [...].
-
-        Args:
-            moments: [..., 3], of the phase.
-            strange: [...], squared distance from all that was demonstrated, 1 for what is usual.
-            some: bool [...].
-            seen: the sample.
-        """
-        mean, deviation = self._belief(moments)
-        spread = seen.moving[..., 0].var(-1, correction=0).sqrt()
-        apart = mean - seen.mean[..., 0]
-        far = apart.abs() / (deviation.square() + spread.square() + FLOOR**2).sqrt()
-        known = ((STRANGE[1] - strange) / (STRANGE[1] - STRANGE[0])).clamp(0, 1)
-        share = ((far - self.settings[6]) / DIFFER).clamp(0, 1) * known * some
-        if not bool((share > 0).any()):
-            return None
-        wider = (deviation / spread.clamp(min=1e-6)).clamp(min=1)
-        return Placement(share * apart, 1 + share * (wider - 1), share * (apart.abs() / ANEW).clamp(max=1))
+        return belief_of(memory.share.sum(-2) @ self._moves().moments, self.likeness.phases)
 
     def _moves(self) -> Moves:
         """What depends on the settings alone, kept while they stay as they are."""
