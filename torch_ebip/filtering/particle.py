@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -13,10 +13,15 @@ from torch_ebip.common.arguments import as_number
 from torch_ebip.common.brief import brief
 from torch_ebip.common.draws import Generators, uniform
 from torch_ebip.filtering import functional
-from torch_ebip.filtering.members import MemberFilter
+from torch_ebip.filtering.members import MemberFilter, NumbersItsStates
 from torch_ebip.filtering.model import StateSpace
 from torch_ebip.filtering.protocols import View
+from torch_ebip.filtering.updates.pace import Pace, led
 from torch_ebip.filtering.updates.trust import RobustWeights
+from torch_ebip.filtering.updates.weighting import Seen
+
+HALF = 0.5
+"""Share to be renewed from which on all is."""
 
 
 class ParticleState(NamedTuple):
@@ -25,10 +30,12 @@ class ParticleState(NamedTuple):
     Attributes:
         members: [..., E, n].
         log_weights: [..., E], normalised.
+        pace: a NamedTuple of tensors, what a `Pace` remembers; None where there is none.
     """
 
     members: Tensor
     log_weights: Tensor
+    pace: Any = None
 
     def __repr__(self) -> str:
         return brief(self)
@@ -69,6 +76,8 @@ class ParticleFilter(MemberFilter):
         softness: resample from (1 - softness) w + softness / E, and weigh by the ratio (soft resampling, Karkus,
             Hsu & Lee 2018): with it, gradients pass through resampling. 0 resamples from w, without gradient.
         trust: what surprising values count, each on top of those before it.
+        pace: holds the clock of the model, and leads particles back that are lost; see `Pace`. Of those that were
+            altogether wrong, half or more of which is to be renewed, all begin anew.
 
     Raises:
         ValueError: fewer than two particles, a threshold outside [0, 1] or a softness outside [0, 1).
@@ -84,6 +93,7 @@ class ParticleFilter(MemberFilter):
         threshold: float = 0.5,
         softness: float = 0.0,
         trust: Iterable[RobustWeights] = (),
+        pace: Pace | None = None,
     ) -> None:
         super().__init__(model, prior, n_members)
         as_number("threshold", threshold, 0, 1)
@@ -92,18 +102,24 @@ class ParticleFilter(MemberFilter):
         self.threshold = threshold
         self.softness = softness
         self.trust = nn.ModuleList(trust)
+        self.pacing = pace
+        if pace is not None:
+            pace.check(model)
 
     def _start(self, batch_shape: tuple[int, ...], chosen: Tensor | None, generator: Generators) -> ParticleState:
         """Equal weights."""
-        started, _ = self._members(batch_shape, chosen, generator)
+        started, origin = self._members(batch_shape, chosen, generator)
         count = started.shape[-2]
-        return ParticleState(started, started.new_full(started.shape[:-1], -math.log(count)))
+        pace = None if self.pacing is None else self.pacing.start(started, origin)
+        return ParticleState(started, started.new_full(started.shape[:-1], -math.log(count)), pace)
 
     def _predict(self, state: ParticleState, dt: Tensor, generator: Generators) -> ParticleState:
         """Resample where it is needed, then x = g(x) + N(0, Q)."""
-        state = self._resample(state, generator)
+        state, pace = self._resample(state, generator), state.pace
+        if self.pacing is not None and pace is not None:
+            pace, dt = self.pacing.elapse(pace, dt)
         members = self.model.advance(state.members, dt, generator)
-        return ParticleState(members, state.log_weights)
+        return ParticleState(members, state.log_weights, pace)
 
     def _resample(self, state: ParticleState, generator: Generators) -> ParticleState:
         batch, count = state.log_weights.shape[:-1], state.log_weights.shape[-1]
@@ -121,7 +137,9 @@ class ParticleFilter(MemberFilter):
         ancestors = torch.where(needed.unsqueeze(-1), ancestors, torch.arange(count, device=u.device))
         members = state.members.gather(-2, ancestors.unsqueeze(-1).expand(state.members.shape))
         resampled = torch.log_softmax(ratio.gather(-1, ancestors), dim=-1)
-        return ParticleState(members, torch.where(needed.unsqueeze(-1), resampled, state.log_weights))
+        return state._replace(
+            members=members, log_weights=torch.where(needed.unsqueeze(-1), resampled, state.log_weights)
+        )
 
     def _update(
         self, state: ParticleState, y: Tensor, observed: Tensor, generator: Generators
@@ -132,7 +150,9 @@ class ParticleFilter(MemberFilter):
             return state, state.members.new_zeros(observed.shape[:-1])
         rows = measured.nonzero().squeeze(-1)
         model = self.model
+        state, counts = self._led(state, y, observed)
         deviation = model.deviation(self.moving(state) if model.noise_depends_on_state else None)[..., rows]
+        deviation = deviation if counts is None else deviation / counts.sqrt().unsqueeze(-1)
         y, observed = torch.where(observed, y, 0)[..., rows], observed[..., rows]
         projections = model.project(state.members, rows)
         if len(self.trust):
@@ -147,15 +167,43 @@ class ParticleFilter(MemberFilter):
         likelihood = torch.logsumexp(joint, dim=-1)
         any_observed = observed.any(-1)
         weights = torch.where(any_observed.unsqueeze(-1), joint - likelihood.unsqueeze(-1), state.log_weights)
-        return ParticleState(state.members, weights), torch.where(any_observed, likelihood, 0)
+        return state._replace(log_weights=weights), torch.where(any_observed, likelihood, 0)
+
+    def _led(self, state: ParticleState, y: Tensor, observed: Tensor) -> tuple[ParticleState, Tensor | None]:
+        """The state where the pace leads it, and what the sample [..., D] counts, [...]; None: 1."""
+        if self.pacing is None or state.pace is None:
+            return state, None
+        moving, still = self.model.split(state.members)
+        mean = self.moving(state)
+        memory, placement = self.pacing.notice(state.pace, Seen(y, observed, None, None, moving, mean, None))
+        state = state._replace(pace=memory)
+        if placement is not None:
+            phase = led(moving[..., 0], mean[..., 0], placement).unsqueeze(-1)
+            members, weights = torch.cat([phase, moving[..., 1:], still], -1), state.log_weights
+            first = self._first(weights.shape[:-1])
+            if first is not None:
+                anew = (placement.renewed >= HALF).unsqueeze(-1)
+                begun = torch.cat([phase.mean(-2, keepdim=True).expand_as(phase), first[..., 1:]], -1)
+                members = torch.where(anew.unsqueeze(-1), begun, members)
+                weights = torch.where(anew, -math.log(weights.shape[-1]), weights)
+            state = state._replace(members=members, log_weights=weights)
+        return state, self.pacing.counts(memory)
+
+    def _first(self, batch: tuple[int, ...]) -> Tensor | None:
+        """Particles as they start, [..., E, n], where nothing is drawn for it; otherwise None."""
+        prior = self.prior
+        if not isinstance(prior, NumbersItsStates) or len(getattr(prior, "states", ())) != self.n_members:
+            return None
+        return prior.start(batch, self.n_members, None, None)[0]
 
     def _narrow(self, view: View) -> None:
         """See `Filter._narrow`."""
         self.trust = nn.ModuleList([trust.select(view) for trust in self.trust])  # type: ignore[operator]
+        self.pacing = None if self.pacing is None else self.pacing.select(view)
 
     def _parts(self) -> list[str]:
         """See `Filter._parts`."""
-        return [type(trust).__name__ for trust in self.trust]
+        return [type(part).__name__ for part in (*self.trust, self.pacing) if part is not None]
 
     def extra_repr(self) -> str:
         """The options that are not modules."""

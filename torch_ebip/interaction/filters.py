@@ -214,13 +214,13 @@ class InteractionFilter(Filter):
     @property
     def pace(self) -> PhaseBank | None:
         """What follows the phase beside the members; None if nothing does."""
-        found = getattr(getattr(self, "analysis", None), "pace", None)
+        found = getattr(getattr(self, "analysis", None), "pace", getattr(self, "pacing", None))
         return found if isinstance(found, PhaseBank) else None
 
     def waits(self, state: State) -> Waits | None:
         """Whether the person of a ``state`` stands still; None where nobody looks."""
-        memory, pace = getattr(state, "memory", None), self.pace
-        return None if memory is None or memory.pace is None or pace is None else pace.waits(memory.pace)
+        held, pace = getattr(getattr(state, "memory", state), "pace", None), self.pace
+        return None if held is None or pace is None else pace.waits(held)
 
     @eager
     def familiarity(self, state: State) -> Tensor:

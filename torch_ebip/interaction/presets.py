@@ -99,7 +99,7 @@ def ebip(
         weighting,
         _localisation(primitive, model) if localise else None,
         None if inflation is None else Inflation(inflation, MOST_GROWTH),
-        pace=None if pace is None else copy.deepcopy(pace).to(primitive.weights),
+        pace=_own(pace, primitive),
     )
     prior = DemonstrationPrior(demonstration_states(primitive, phase))
     filter = InteractionEnsembleFilter(model, prior, len(primitive) if n_members is None else n_members, update)
@@ -192,13 +192,14 @@ def particle_filter(
     softness: float = 0.0,
     robust: RobustWeights | None = None,
     phase: PhaseModel | None = None,
+    pace: PhaseBank | None = None,
 ) -> InteractionParticleFilter:
     """The paper's PF: particles are demonstrations, systematic resampling where N_eff < E/2.
 
     Args:
         primitive: of the demonstrations.
         n_members: E; default: N, each demonstration once. Otherwise they are drawn with replacement.
-        residual_variance, weight_noise, context, robust, phase: see `ebip`.
+        residual_variance, weight_noise, context, robust, phase, pace: see `ebip`.
         softness: of the resampling, see `ParticleFilter`; needed for gradients through it.
 
     Returns:
@@ -208,7 +209,12 @@ def particle_filter(
     prior = DemonstrationPrior(demonstration_states(primitive, phase))
     count = len(primitive) if n_members is None else n_members
     trust = _trust(robust, primitive)
-    return InteractionParticleFilter(model, prior, count, softness=softness, trust=trust)
+    return InteractionParticleFilter(model, prior, count, softness=softness, trust=trust, pace=_own(pace, primitive))
+
+
+def _own(pace: PhaseBank | None, primitive: InteractionPrimitive) -> PhaseBank | None:
+    """A bank of one filter alone."""
+    return None if pace is None else copy.deepcopy(pace).to(primitive.weights)
 
 
 def _trust(robust: RobustWeights | None, primitive: InteractionPrimitive) -> list[RobustWeights]:

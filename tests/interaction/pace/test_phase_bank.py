@@ -21,6 +21,7 @@ from torch_ebip import (
     PhaseBank,
     StackedBasis,
     ebip,
+    particle_filter,
 )
 from torch_ebip.filtering.updates.weighting import Seen
 from torch_ebip.interaction.pace.likeness import CAP
@@ -45,6 +46,18 @@ class TestPaced(FilterContract):
 
     def make_without_draws(self) -> InteractionFilter:
         return silent(paced(torch.float64))  # type: ignore[return-value]
+
+
+class TestPacedParticles(FilterContract):
+    def make(self, dtype: torch.dtype = torch.float32) -> InteractionFilter:
+        primitive = small_primitive(dtype)
+        bank, variance = PhaseBank.of(primitive), 1e3 * primitive.residual_variance
+        return particle_filter(primitive, residual_variance=variance, softness=0.2, pace=bank)
+
+    def make_without_draws(self) -> InteractionFilter:
+        made = silent(self.make(torch.float64))
+        made.threshold = 0.0
+        return made  # type: ignore[return-value]
 
 
 def numpy_bank(values: np.ndarray, times: np.ndarray, bank: PhaseBank) -> list[np.ndarray]:
@@ -243,6 +256,25 @@ def test_it_finds_people_who_pause_start_late_or_start_over(kind: str) -> None:
     found, before = (float(np.median(errors[name])) for name in ("with", "without"))
     assert found < 2 / 24  # two cells of the bank's grid
     assert found < (1.3 * before + 0.01 if kind == "nothing" else 0.6 * before)
+
+
+@pytest.mark.parametrize("kind", ["pause", "late", "again"])
+def test_particles_are_led_too(kind: str) -> None:
+    """The median error of the phase at the end, with and without a bank."""
+    primitive = small_primitive(torch.float64)
+    variance = 1e3 * primitive.residual_variance
+    errors: dict[bool, list[float]] = {True: [], False: []}
+    for values in list(interactions(12, seed=77, dtype=torch.float64)):
+        told, phase = disturbed(kind, values.nan_to_num(0.5), 30.0)
+        shown = torch.where(HUMAN, told, torch.nan)[phase < 0.9]
+        for with_it, found in errors.items():
+            bank = PhaseBank.of(primitive) if with_it else None
+            made = particle_filter(primitive, residual_variance=variance, pace=bank)
+            with torch.no_grad():
+                trace = made(shown, generator=torch.Generator().manual_seed(0))
+            found.append(float((trace.phase[-6:] - phase[phase < 0.9][-6:]).abs().mean()))
+    assert np.median(errors[True]) < 2.5 / 24
+    assert np.median(errors[True]) < 0.7 * np.median(errors[False])
 
 
 def test_it_says_that_somebody_stands_still_and_that_the_end_is_later() -> None:
