@@ -20,7 +20,7 @@ from experiments.catch.controllers import LEAD
 from experiments.catch.jobs import METHODS, Plan, as_settings, run_all
 from experiments.catch.learning import learn
 from experiments.catch.table import markdown, print_table, summarise
-from experiments.catch.throws import LATENCY
+from experiments.catch.throws import DISTURBANCES, LATENCY
 from experiments.command_line import add_run_options, command, experiment_parser
 from experiments.run_folder import RunFolder
 from torch_ebip.common.files import atomic_write, read_json
@@ -44,11 +44,13 @@ def main(arguments: list[str] | None = None) -> None:
     methods = _methods(options.methods)
     sensors, share = _drop(options.drop)
     lead = _lead(options.lead)
-    plan = Plan("", throws, demonstrations, options.seed, lead, options.arm, sensors, share)
+    plan = Plan("", throws, demonstrations, options.seed, lead, options.arm, sensors, share, options.disturb)
     settings = {**as_settings(plan, methods), "steps": steps, "filter": options.filter}
     taken = {} if options.filter is None else _take(Path(options.filter), plan)
     run = RunFolder("catch", settings, options.out, options.force, arguments)
-    plan = Plan(str(run.path), throws, demonstrations, options.seed, lead, options.arm, sensors, share)
+    plan = Plan(
+        str(run.path), throws, demonstrations, options.seed, lead, options.arm, sensors, share, options.disturb
+    )
     if options.filter is None:
         with learning_bar() as show:
             learn(run.path, demonstrations, options.seed, steps, show)
@@ -134,6 +136,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--drop", metavar="SENSOR@SHARE", help="a sensor that falls silent at that share of each throw, as in imu@0.3"
+    )
+    parser.add_argument(
+        "--disturb",
+        choices=DISTURBANCES,
+        help="every second thrower hesitates for 0.3 to 1 s in the wind-up, or the sensors of every second throw "
+        "start when it is under way, a fifth to a half of the way to the release",
     )
     parser.add_argument(
         "--arm",

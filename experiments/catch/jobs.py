@@ -35,7 +35,8 @@ PORTION = 20
 
 @dataclass(frozen=True)
 class Plan:
-    """Everything that decides the result; `sensors` and `share` say what is cut off when, `arm` how fast it is."""
+    """Everything that decides the result; `sensors` and `share` say what is cut off when, `arm` how fast it is,
+    `disturbance` what befalls every second throw."""
 
     folder: str
     throws: int
@@ -45,6 +46,7 @@ class Plan:
     arm: float
     sensors: tuple[str, ...]
     share: float
+    disturbance: str | None = None
 
     @property
     def limits(self) -> Limits:
@@ -87,7 +89,8 @@ class Bench:
     def tosses(self, condition: str) -> list[Toss]:
         """All throws of a condition."""
         if condition not in self._tosses:
-            self._tosses[condition] = draw(condition, self.plan.throws, self.plan.seed, self.plan.limits)
+            plan = self.plan
+            self._tosses[condition] = draw(condition, plan.throws, plan.seed, plan.limits, plan.disturbance)
         return self._tosses[condition]
 
     def controller(self, method: str, toss: Toss) -> Controller:

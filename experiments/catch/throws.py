@@ -9,6 +9,7 @@ import numpy as np
 from experiments.ball_catching import flight as ballistics
 from experiments.ball_catching import sensors, thrower
 from experiments.ball_catching.geometry import DISTANCE, RATE, TABLE_HEIGHT, Array
+from experiments.ball_catching.hesitation import hesitating
 from experiments.ball_catching.scene import Limits, Reach, travel_time
 from experiments.ball_catching.sensors import LAYOUT
 from experiments.ball_catching.teacher import HABITS, LOWEST
@@ -25,6 +26,10 @@ LATENCY = {
     "ball": 0.016,
 }
 """s from a sample to its arrival: motion capture, radio links, a depth camera with its image processing."""
+DISTURBANCES = ("hesitate", "late")
+"""A thrower who stops in the wind-up; sensors that start when the throw is under way."""
+LATE = (0.2, 0.5)
+"""Shares of the way to the release, between which sensors start that do so late."""
 JITTER = 0.003
 """s, mean of what comes on top, exponentially distributed."""
 OUTSTRETCHED = 1.12
@@ -67,7 +72,9 @@ class Toss:
     catchable: bool
 
 
-def draw(condition: str, count: int, seed: int, limits: Limits | None = None) -> list[Toss]:
+def draw(
+    condition: str, count: int, seed: int, limits: Limits | None = None, disturbance: str | None = None
+) -> list[Toss]:
     """Throws of a condition: ``count`` of them, fixed by the seed; a longer series begins with the shorter one.
 
     Args:
@@ -75,21 +82,33 @@ def draw(condition: str, count: int, seed: int, limits: Limits | None = None) ->
         count: how many.
         seed: of everything about them.
         limits: of the arm, for what is catchable.
+        disturbance: one of `DISTURBANCES`, of every second throw; None: of none.
     """
     limits = Limits() if limits is None else limits
     made: list[Toss] = []
     reach, batch = Reach(), 0
     while len(made) < count:
         rng = np.random.default_rng([seed, CONDITIONS.index(condition), batch, 5])
-        made += _batch(rng, condition == "blindfolded", reach, len(made), limits)
+        made += _batch(rng, condition == "blindfolded", reach, len(made), limits, disturbance)
         batch += 1
     return made[:count]
 
 
 def _batch(
-    rng: np.random.Generator, blindfolded: bool, reach: Reach, first: int, limits: Limits, n: int = 50
+    rng: np.random.Generator,
+    blindfolded: bool,
+    reach: Reach,
+    first: int,
+    limits: Limits,
+    disturbance: str | None = None,
+    n: int = 50,
 ) -> list[Toss]:
     throw = thrower.plan(rng, n, blindfolded)
+    # Draws of their own: the throws are otherwise the same.
+    other = np.random.default_rng([first, int(blindfolded), 23])
+    if disturbance == "hesitate":
+        throw = hesitating(other, throw)
+    silent = np.where(np.arange(n) % 2 == 1, other.uniform(*LATE, n), 0.0) if disturbance == "late" else np.zeros(n)
     hand = throw.body(throw.release[:, None]).right_hand
     flight = ballistics.fly(hand.p[:, 0], hand.v[:, 0], 2.0)
     t = np.arange(int((throw.release.max() + 2.0) * RATE)) / RATE * np.ones((n, 1))
@@ -114,7 +133,7 @@ def _batch(
                 flight.position[i, 0],
                 flight.velocity[i, 0],
                 float(end[i]),
-                _packets(rng, values),
+                _packets(rng, values, float(silent[i] * throw.release[i])),
                 t[i, :length],
                 body.right_hand.p[i, :length],
                 figure[i, :length],
@@ -124,14 +143,15 @@ def _batch(
     return tosses
 
 
-def _packets(rng: np.random.Generator, values: Array) -> list[Packet]:
-    """Samples [T, D] of all sensors at `RATE`, as they arrive; what was not measured at all is not sent."""
+def _packets(rng: np.random.Generator, values: Array, silent: float) -> list[Packet]:
+    """Samples [T, D] of all sensors at `RATE`, as they arrive, from ``silent`` s on; what was not measured is not
+    sent."""
     packets = []
     for name, latency in LATENCY.items():
         part = values[:, LAYOUT.slice(name)]
         delays = latency + rng.exponential(JITTER, len(part))
         for k, (sample, delay) in enumerate(zip(part, delays, strict=True)):
-            if not np.isnan(sample).all():
+            if not np.isnan(sample).all() and k / RATE >= silent:
                 packets.append(Packet(k / RATE + delay, k / RATE, name, sample))
     return sorted(packets, key=lambda packet: packet.arrival)
 
