@@ -11,17 +11,20 @@ from __future__ import annotations
 import argparse
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
 from experiments.command_line import add_data_options, add_run_options, command, experiment_parser
 from experiments.data import load
-from experiments.folds import in_processes, share_cores
+from experiments.folds import in_processes, share_cores, split
+from experiments.interruptions.animation import film
 from experiments.interruptions.jobs import METHODS, Answers, Job, Plan, all_of, run_fold
 from experiments.interruptions.picture import interruptions_figure
 from experiments.interruptions.table import markdown, print_table, summarise
 from experiments.run_folder import RunFolder, save_figure
+from torch_ebip import Demonstrations, load_model
 from torch_ebip.common.files import atomic_write
 
 
@@ -63,9 +66,21 @@ def main(arguments: list[str] | None = None) -> None:
     save_figure(interruptions_figure(rows), run.path / "interruptions.png")
     with atomic_write(run.path / "results.md") as file:
         file.write(markdown(rows).encode())
+    if options.film:
+        _film(plan, demonstrations)
     run.finish(results)
     print_table(rows)
     print(f"{results['seconds']:.0f} s; written to {run.path}")
+
+
+def _film(plan: Plan, demonstrations: Demonstrations) -> None:
+    """Of the first fold's model and the first of its test interactions."""
+    _, testing = split(len(demonstrations), plan.folds, 0, plan.seed)
+    model = load_model(Path(plan.folder) / "fold-00" / "learned")
+    if model.filter.pace is None:
+        print("no film: the model of the first fold has no bank of phase hypotheses, see its report")
+        return
+    film(model, model.prepare(demonstrations.subset(testing[:1])), Path(plan.folder) / "pause.gif", seed=plan.seed)
 
 
 def _headline(answers: Answers, method: str) -> str:
@@ -86,6 +101,7 @@ def _parser() -> argparse.ArgumentParser:
         help=f"of {', '.join(METHODS)} (default: all)",
     )  # fmt: skip
     parser.add_argument("--members", type=int, default=None, metavar="E", help="of ensembles (default: all)")
+    parser.add_argument("--film", action="store_true", help="draw a film of a pause, pause.gif")
     parser.add_argument("--steps", type=int, default=100, help="gradient steps at most (default: 100)")
     add_run_options(parser, "interruptions", "data, interruptions and draws", "a run of a minute", workers=True)
     return parser

@@ -6,13 +6,16 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from experiments.interruptions.__main__ import main
+from experiments.interruptions.animation import film, tell
 from experiments.interruptions.kinds import KINDS, moments
 from experiments.interruptions.table import summarise
-from tests.conftest import interactions
+from tests.conftest import interactions, small_primitive
+from torch_ebip import InteractionModel, PhaseBank, ebip
 from torch_ebip.common.draws import seeded
 
 
@@ -34,6 +37,20 @@ def test_the_command_at_a_small_size(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "pause of 1 to 3 s" in capsys.readouterr().out
     with pytest.raises(SystemExit, match="finished run"):
         main([*run, "--out", str(tmp_path / "run")])
+
+
+def test_a_pause_is_filmed(tmp_path: Path) -> None:
+    primitive = small_primitive()
+    model = InteractionModel(ebip(primitive, square_root=True, pace=PhaseBank.of(primitive)), primitive)
+    values = interactions(3, seed=5)[1].nan_to_num(0.5)
+    story, sensor, target = tell(model, values, 1.0, 0)
+    assert (sensor, target) == ("hand.x [m]", "arm.1 [rad]")
+    assert len(story.time) == len(values) + 30
+    np.testing.assert_allclose(story.bank.sum(1), 1, atol=1e-5)
+    standing = (np.diff(story.truth) == 0).nonzero()[0]
+    assert story.standing[standing[-1]] > 0.8 > story.standing[standing[0]]
+    film(model, interactions(3, seed=5).subset([1]), tmp_path / "pause.gif", 0.5)
+    assert (tmp_path / "pause.gif").read_bytes()[:4] == b"GIF8"
 
 
 def test_filters_are_asked_during_after_and_late() -> None:
