@@ -178,12 +178,12 @@ class ParticleFilter(MemberFilter):
         memory, placement = self.pacing.notice(state.pace, Seen(y, observed, None, None, moving, mean, None))
         state = state._replace(pace=memory)
         if placement is not None:
-            phase = led(moving[..., 0], mean[..., 0], placement).unsqueeze(-1)
-            members, weights = torch.cat([phase, moving[..., 1:], still], -1), state.log_weights
+            entry = led(moving[..., 0], mean[..., 0], placement).unsqueeze(-1)
+            members, weights = torch.cat([entry, moving[..., 1:], still], -1), state.log_weights
             first = self._first(weights.shape[:-1])
             if first is not None:
                 anew = (placement.renewed >= HALF).unsqueeze(-1)
-                begun = torch.cat([phase.mean(-2, keepdim=True).expand_as(phase), first[..., 1:]], -1)
+                begun = torch.cat([entry.mean(-2, keepdim=True).expand_as(entry), first[..., 1:]], -1)
                 members = torch.where(anew.unsqueeze(-1), begun, members)
                 weights = torch.where(anew, -math.log(weights.shape[-1]), weights)
             state = state._replace(members=members, log_weights=weights)

@@ -48,7 +48,7 @@ def placed(
 
 def place_columns(columns: ColumnMembers, mean: Tensor, placement: Placement) -> None:
     """Lead members that are columns, whose moving entries have a mean [..., m]; what stands still is renewed."""
-    phase = columns.moving.select(-2, 0)
-    phase.copy_(led(phase, mean.select(-1, 0), placement))
+    entry = columns.moving.select(-2, 0)
+    entry.copy_(led(entry, mean.select(-1, 0), placement))
     if bool((placement.renewed > 0).any()):
         columns.renew(placement.renewed)
