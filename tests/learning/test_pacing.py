@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests.conftest import interactions
-from torch_ebip import InteractionModel, learn, load_model
+from torch_ebip import Demonstrations, InteractionModel, learn, load_model
 from torch_ebip.common.draws import seeded
 from torch_ebip.learning.interruptions import again, at_speed, idle, interrupted, late, pause, undisturbed
 
@@ -94,3 +94,12 @@ def test_it_is_better_for_people_who_were_never_seen(model: InteractionModel) ->
 
 def test_too_few_learn_no_pace() -> None:
     assert "pace" not in learn(interactions(8), steps=0, scan=4).report
+
+
+def test_sensors_that_never_move_have_no_bank_and_the_report_says_so() -> None:
+    known = interactions(12)
+    still = torch.tensor([True, True, True, False, False])
+    values = [torch.where(still, 0.3, trajectory.nan_to_num()) for trajectory in known]
+    told = learn(Demonstrations(known.layout, values, known.rate), steps=0, scan=4).report["pace"]
+    assert not told["used"]
+    assert "sensors that move" in told["reason"]

@@ -91,12 +91,11 @@ class EnsembleFilter(MemberFilter):
         return carrier.state, likelihood
 
     def first(self, state: EnsembleState) -> Tensor | None:
-        """How the members of a state started, as deviations [..., E, n] from its centre; None if nobody knows."""
+        """How the members of a state started, [..., E, n]; None if nobody knows."""
         origin = state.memory.origin
         if origin is None or not isinstance(self.prior, NumbersItsStates):
             return None
-        members, _ = self.prior.start(state.deviations.shape[:-2], origin.shape[-1], origin, None)
-        return members if state.centre is None else members - state.centre.unsqueeze(-2)
+        return self.prior.start(state.deviations.shape[:-2], origin.shape[-1], origin, None)[0]
 
     def _centre(self, state: EnsembleState) -> Tensor | None:
         """See `MemberFilter._centre`."""

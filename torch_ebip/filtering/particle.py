@@ -16,7 +16,7 @@ from torch_ebip.filtering import functional
 from torch_ebip.filtering.members import MemberFilter, NumbersItsStates
 from torch_ebip.filtering.model import StateSpace
 from torch_ebip.filtering.protocols import View
-from torch_ebip.filtering.updates.pace import Pace, led
+from torch_ebip.filtering.updates.pace import Pace, led, quantiles
 from torch_ebip.filtering.updates.trust import RobustWeights
 from torch_ebip.filtering.updates.weighting import Seen
 
@@ -115,9 +115,9 @@ class ParticleFilter(MemberFilter):
 
     def _predict(self, state: ParticleState, dt: Tensor, generator: Generators) -> ParticleState:
         """Resample where it is needed, then x = g(x) + N(0, Q)."""
-        state, pace = self._resample(state, generator), state.pace
-        if self.pacing is not None and pace is not None:
-            pace, dt = self.pacing.elapse(pace, dt)
+        state, pace = self._resample(state, generator), None
+        if self.pacing is not None:
+            pace, dt = self.pacing.elapse(self._remembered(state), dt)
         members = self.model.advance(state.members, dt, generator)
         return ParticleState(members, state.log_weights, pace)
 
@@ -171,11 +171,13 @@ class ParticleFilter(MemberFilter):
 
     def _led(self, state: ParticleState, y: Tensor, observed: Tensor) -> tuple[ParticleState, Tensor | None]:
         """The state where the pace leads it, and what the sample [..., D] counts, [...]; None: 1."""
-        if self.pacing is None or state.pace is None:
+        if self.pacing is None:
             return state, None
         moving, still = self.model.split(state.members)
         mean = self.moving(state)
-        memory, placement = self.pacing.notice(state.pace, Seen(y, observed, None, None, moving, mean, None))
+        memory, placement = self.pacing.notice(
+            self._remembered(state), Seen(y, observed, None, None, moving, mean, None)
+        )
         state = state._replace(pace=memory)
         if placement is not None:
             entry = led(moving[..., 0], mean[..., 0], placement).unsqueeze(-1)
@@ -183,11 +185,18 @@ class ParticleFilter(MemberFilter):
             first = self._first(weights.shape[:-1])
             if first is not None:
                 anew = (placement.renewed >= HALF).unsqueeze(-1)
-                begun = torch.cat([entry.mean(-2, keepdim=True).expand_as(entry), first[..., 1:]], -1)
+                spread = placement.deviation.unsqueeze(-1) * quantiles(entry.shape[-2], entry)
+                begun = (mean[..., 0] + placement.offset).unsqueeze(-1) + spread
+                begun = torch.cat([begun.unsqueeze(-1), first[..., 1:]], -1)
                 members = torch.where(anew.unsqueeze(-1), begun, members)
                 weights = torch.where(anew, -math.log(weights.shape[-1]), weights)
             state = state._replace(members=members, log_weights=weights)
         return state, self.pacing.counts(memory)
+
+    def _remembered(self, state: ParticleState) -> Any:
+        """What a state remembers for the pace: nothing yet, if it was made by hand."""
+        assert self.pacing is not None
+        return self.pacing.start(state.members, None) if state.pace is None else state.pace
 
     def _first(self, batch: tuple[int, ...]) -> Tensor | None:
         """Particles as they start, [..., E, n], where nothing is drawn for it; otherwise None."""

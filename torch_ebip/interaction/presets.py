@@ -214,6 +214,8 @@ def particle_filter(
 
 def _own(pace: PhaseBank | None, primitive: InteractionPrimitive) -> PhaseBank | None:
     """A bank of one filter alone."""
+    if pace is not None and pace.n_all != len(primitive):
+        raise ValueError(f"the phase bank is of {pace.n_all} demonstrations, the primitive has {len(primitive)}")
     return None if pace is None else copy.deepcopy(pace).to(primitive.weights)
 
 

@@ -50,10 +50,14 @@ def learn_pace(
 
     Returns:
         ``used``, ``sharpness`` and ``agree``, and the CRPS over all horizons and DoFs, in units of the targets'
-        spread, ``with`` and ``without`` it, of interactions ``undisturbed`` and ``interrupted``.
+        spread, ``with`` and ``without`` it, of interactions ``undisturbed`` and ``interrupted``; or a ``reason``.
     """
     task = held_out.task
     primitive = task.primitive
+    try:
+        banks = {settings: _bank(primitive, *settings) for settings in TRIED}
+    except ValueError as error:
+        return {"used": False, "reason": str(error)}
     # As on the robot: a step of the bank is a tenth of a second, and tuning thins more than that.
     unthinned = replace(held_out.settings, thinning=1)
     noise = primitive.residual_variance.sqrt().cpu()
@@ -73,7 +77,6 @@ def learn_pace(
 
     without = scores()
     tried: dict[tuple[float, float], dict[str, float]] = {}
-    banks = {settings: _bank(primitive, *settings) for settings in TRIED}
     for settings, bank in banks.items():
         filter.analysis.pace = bank
         tried[settings] = scores()

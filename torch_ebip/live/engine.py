@@ -43,6 +43,9 @@ class Engine(Protocol):
     def forecast(self, phase: Tensor) -> Forecast:
         """Of the controlled DoFs at phases [P]."""
 
+    def forecast_ahead(self, seconds: Tensor) -> Forecast:
+        """Of the controlled DoFs so many seconds ahead, [P]; infinity is the end."""
+
     def labels(self) -> dict[str, float]:
         """Probability of each label; empty where the filter cannot say."""
 
@@ -108,6 +111,10 @@ class _LiveEngine:
     def forecast(self, phase: Tensor) -> Forecast:
         """See `Engine`."""
         return self._live.forecast(phase, self._controlled)
+
+    def forecast_ahead(self, seconds: Tensor) -> Forecast:
+        """See `Engine`."""
+        return self._live.forecast(None, self._controlled, ahead=seconds)
 
     def labels(self) -> dict[str, float]:
         """See `Engine`."""
@@ -186,6 +193,11 @@ class _StateEngine:
     def forecast(self, phase: Tensor) -> Forecast:
         """See `Engine`."""
         return self._filter.forecast(self._state, phase).select(self._controlled.to(phase.device))
+
+    @torch.no_grad()
+    def forecast_ahead(self, seconds: Tensor) -> Forecast:
+        """See `Engine`."""
+        return self._filter.forecast(self._state, ahead=seconds).select(self._controlled.to(seconds.device))
 
     @torch.no_grad()
     def labels(self) -> dict[str, float]:

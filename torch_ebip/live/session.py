@@ -174,7 +174,7 @@ class InteractionSession:
             if horizon is not None:
                 gone = self._timeline.gone(horizons)
                 phases = [min(max(phase + velocity * seconds, 0.0), 1.0) for seconds in gone]
-            expected = self._timeline.forecast(phases)
+            expected = self._timeline.forecast(phases, horizons if horizon is not None else [math.inf])
             mean, deviation = expected.mean, expected.variance.sqrt()
             if self._log is not None:
                 asked = horizons if several else horizons[0] if horizons else None

@@ -160,8 +160,7 @@ class Timeline:
     def phase_now(self) -> tuple[float, float]:
         """Phase and its velocity, 1/s, at the present: since the last tick the interaction went on."""
         phase, velocity = self._engine.clock()
-        since = 0.0 if self.waiting else self._now - self._time(max(self._head, 0))
-        return phase + velocity * self.gone([since])[0], velocity
+        return phase + velocity * self.gone([self._since()])[0], velocity
 
     def gone(self, seconds: Sequence[float]) -> list[float]:
         """How long of so many seconds the interaction goes on, s."""
@@ -173,9 +172,18 @@ class Timeline:
         waits = self._engine.waits()
         return 0.0 if waits is None else float(waits.rest)
 
-    def forecast(self, phases: Sequence[float]) -> Forecast:
-        """Of the controlled DoFs at some phases."""
-        return self._engine.forecast(self._like.new_tensor(phases))
+    def forecast(self, phases: Sequence[float], horizons: Sequence[float]) -> Forecast:
+        """Of the controlled DoFs at some phases, so many seconds ahead of the present; infinity: the end.
+
+        Of a person who may stand still the seconds count: how far they will get is not one phase.
+        """
+        if self._engine.waits() is None or min(horizons) < 0:
+            return self._engine.forecast(self._like.new_tensor(phases))
+        return self._engine.forecast_ahead(self._like.new_tensor(horizons) + self._since())
+
+    def _since(self) -> float:
+        """How long ago the last tick was, s."""
+        return 0.0 if self.waiting else max(self._now - self._time(max(self._head, 0)), 0.0)
 
     def labels(self) -> dict[str, float]:
         """Probability of each label."""

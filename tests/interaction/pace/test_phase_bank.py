@@ -14,6 +14,7 @@ from tests.interaction.test_ebip import silent
 from torch_ebip import (
     BSplineBasis,
     Demonstrations,
+    EnsembleState,
     InteractionFilter,
     InteractionPrimitive,
     InteractionSession,
@@ -193,6 +194,7 @@ def test_the_time_that_is_gone_is_that_of_a_person_who_waits(held: float) -> Non
     start = bank.start(torch.zeros(24, 3).double(), None)
     memory = start._replace(standing=torch.tensor(0.4 + 0.4 * held).double(), clock=torch.tensor(0.0).double())
     assert float(bank.held(memory)) == pytest.approx(held, abs=1e-6)
+    assert bank.waits(memory).gone(torch.tensor([-0.5]).double()).tolist() == [-0.5]  # what is past is past
     seconds = torch.tensor([0.2, 1.0, 4.0, math.inf]).double()
     generator = np.random.default_rng(0)
     waits = np.where(generator.random(200_000) < held, generator.exponential(1 / 1.5, 200_000), 0)
@@ -394,3 +396,106 @@ def test_a_sensor_that_lies_does_not_decide() -> None:
 def test_bad_settings_are_named(settings: dict[str, float], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         PhaseBank.of(small_primitive(), **settings)  # type: ignore[arg-type]
+
+
+def test_a_state_made_by_hand_is_led_alike_by_both_engines() -> None:
+    """With the memory of another one and no centre; and without any memory."""
+    made = paced(torch.float64)
+    start = made.initial_state()
+    values = interactions(3, seed=77, dtype=torch.float64)[1]
+    y = torch.where(HUMAN, disturbed("late", values, 30.0)[0], torch.nan)
+    for state in (EnsembleState(start.members, start.memory), EnsembleState(start.members)):
+        if state.memory.weighting is None:
+            made = ebip(small_primitive(torch.float64), square_root=True, pace=made.pace)
+        with torch.no_grad():
+            span, dense = (
+                made(y, state=state, engine=engine, generator=torch.Generator().manual_seed(0))
+                for engine in ("span", "dense")
+            )
+        torch.testing.assert_close(span.state.members, dense.state.members)
+
+
+def test_gradients_are_finite_where_all_members_are_at_one_phase() -> None:
+    made = paced(torch.float64)
+    values = interactions(3, seed=77, dtype=torch.float64)[1]
+    state = made.initial_state()
+    deviations = state.deviations.clone().requires_grad_()
+    state = state._replace(deviations=deviations)
+    for row in values[15:21]:
+        state, _ = made.update(made.predict(state, made.dt), torch.where(HUMAN, row, torch.nan))
+    made.forecast(state, 1.0).mean.sum().backward()
+    assert deviations.grad is not None
+    assert deviations.grad.isfinite().all()
+
+
+def test_a_sample_that_is_refused_leads_nobody() -> None:
+    made = ebip(small_primitive(), pace=PhaseBank.of(small_primitive()))
+    values = interactions(3, seed=77)[1]
+    live = LiveFilter(made, HUMAN, generator=torch.Generator().manual_seed(0))
+    for row in values[:12]:
+        live.predict()
+        live.update(torch.where(HUMAN, row, torch.nan))
+    for _ in range(4):  # at one of these the bank takes a step
+        live.predict()
+        before = live.state
+        with pytest.raises(ValueError, match="factored|finite|large|infinite|NaN"):
+            live.update(torch.tensor([1e19, 0.0, 0.0, torch.nan, torch.nan]))
+        assert torch.equal(live.state.members, before.members)
+        assert torch.equal(live.state.memory.pace.sums, before.memory.pace.sums)
+        assert torch.equal(live.state.memory.pace.share, before.memory.pace.share)
+
+
+@pytest.mark.parametrize("absurd", [1e12, 3e38])
+def test_what_is_absurd_leaves_the_bank_alive(absurd: float) -> None:
+    bank = PhaseBank.of(small_primitive())
+    memory = bank.start(torch.zeros(24, 3), None)
+    values = interactions(3, seed=77)[1].nan_to_num(0.5).clone()
+    values[10, 0] = absurd
+    for row in values[:30]:
+        memory, _ = bank.elapse(memory, torch.tensor(1 / 30))
+        memory, _ = bank.notice(memory, seen_of(row))
+    assert memory.share.isfinite().all()
+    assert float(bank.belief(memory)[0]) == pytest.approx(30 / len(values), abs=0.12)
+
+
+def test_a_silence_of_all_sensors_costs_nothing() -> None:
+    """People walk on while nobody looks: the ensemble, which foresaw that, is not led astray afterwards."""
+    primitive = small_primitive(torch.float64)
+    errors: dict[bool, list[float]] = {True: [], False: []}
+    for values in list(interactions(12, seed=77, dtype=torch.float64)):
+        shown = torch.where(HUMAN, values.nan_to_num(0.5), torch.nan)
+        shown[10:22] = torch.nan
+        stop, phase = 26, torch.linspace(0, 1, len(values)).double()
+        for with_it, found in errors.items():
+            bank = PhaseBank.of(primitive, agree=2.0) if with_it else None
+            made = ebip(primitive, residual_variance=30 * primitive.residual_variance, square_root=True, pace=bank)
+            with torch.no_grad():
+                trace = made(shown[:stop], generator=torch.Generator().manual_seed(0))
+            found.append(float((trace.phase[-4:] - phase[stop - 4 : stop]).abs().mean()))
+    assert np.mean(errors[True]) < np.mean(errors[False]) + 0.02
+
+
+def test_particles_that_were_wrong_begin_anew_as_wide_as_the_bank_is() -> None:
+    primitive = small_primitive(torch.float64)
+    made = particle_filter(
+        primitive, residual_variance=1e4 * primitive.residual_variance, pace=PhaseBank.of(primitive)
+    )
+    values = interactions(3, seed=77, dtype=torch.float64)[1]
+    state, generator = made.initial_state(), torch.Generator().manual_seed(0)
+    widest = 0.0
+    for row in values[18:24]:
+        state = made.predict(state, made.dt, generator)
+        state, _ = made.update(state, torch.where(HUMAN, row, torch.nan), generator=generator)
+        widest = max(widest, float(state.members[:, 0].std()))
+    assert widest > 0.02
+    assert float(made.phase(state)) == pytest.approx(21 / len(values), abs=0.15)
+
+
+def test_a_bank_of_other_demonstrations_is_refused() -> None:
+    with pytest.raises(ValueError, match="phase bank is of 24 demonstrations, the primitive has 12"):
+        ebip(small_primitive(count=12), pace=PhaseBank.of(small_primitive()))
+    still = Demonstrations(
+        interactions().layout, [torch.where(HUMAN, 0.3, v.nan_to_num()) for v in interactions()], 30
+    )
+    with pytest.raises(ValueError, match="compares sensors that move"):
+        PhaseBank.of(InteractionPrimitive.fit(still, StackedBasis([BSplineBasis(6)] * 5)))

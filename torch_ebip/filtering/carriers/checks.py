@@ -5,6 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torch_ebip.filtering.functional.linear import FactorisationError, cholesky
+from torch_ebip.filtering.model import StateSpace
+
 
 def measured_dofs(
     y: Tensor, observed: Tensor | None, like: Tensor, batch_shape: tuple[int, ...], n_dofs: int
@@ -28,3 +31,11 @@ def measured_dofs(
     some = observed.any(0)
     mask = None if bool((observed == some).all()) else observed
     return tuple(some.tolist()), mask
+
+
+def explain(S: Tensor, dofs: Tensor, model: StateSpace) -> None:
+    """Raise the error of an innovation covariance [..., K, K] of some DoFs int64 [K] that cannot be factored."""
+    try:
+        cholesky(S, dofs)
+    except FactorisationError as error:
+        raise model.named(error, None) from error

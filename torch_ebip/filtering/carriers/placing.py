@@ -30,7 +30,7 @@ def placed(
         state: not changed.
         y: [..., D], units of the DoFs.
         observed: bool [..., D], something of it True.
-        first: says how members started, as deviations [..., E, n]; None where nobody knows.
+        first: says how members started, [..., E, n]; None where nobody knows.
     """
     members = state.deviations
     moving, still = model.split(members)
@@ -40,6 +40,7 @@ def placed(
     if placement is not None:
         start = first(state) if bool((placement.renewed > 0).any()) else None
         if start is not None:
+            start = start if state.centre is None else start - state.centre.unsqueeze(-2)
             still = torch.lerp(still, start[..., moving.shape[-1] :], placement.renewed[..., None, None])
         first_entry = led(moving[..., 0], mean[..., 0], placement).unsqueeze(-1)
         members = torch.cat([first_entry, moving[..., 1:], still], -1)

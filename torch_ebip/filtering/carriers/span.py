@@ -23,6 +23,7 @@ from torch import Tensor
 from torch_ebip.common.draws import Generators, fill_standard_normal, is_several, standard_normal
 from torch_ebip.common.modules import Versions
 from torch_ebip.filtering.carriers.carrier import Carrier, Measured
+from torch_ebip.filtering.carriers.checks import explain
 from torch_ebip.filtering.carriers.columns import ColumnMembers
 from torch_ebip.filtering.carriers.placing import place_columns
 from torch_ebip.filtering.carriers.plan import Plan, Plans
@@ -30,7 +31,6 @@ from torch_ebip.filtering.carriers.serving import AdvancesColumns, HasFactor, Pr
 from torch_ebip.filtering.carriers.step_noise import StepNoise
 from torch_ebip.filtering.centring import taken_out
 from torch_ebip.filtering.functional.innovation import Taper
-from torch_ebip.filtering.functional.linear import FactorisationError, cholesky
 from torch_ebip.filtering.functional.moments import member_shares
 from torch_ebip.filtering.functional.update import Spread
 from torch_ebip.filtering.model import StateSpace
@@ -48,8 +48,7 @@ class SpanCarrier(Carrier):
         sensors: bool [D], the DoFs that may be measured. The fewer, the faster.
         state: where to start.
         generator: of all draws.
-        first: how members started, as deviations [..., E, n] from the state's centre, for a `Pace`; None where nobody
-            knows.
+        first: how members started, [..., E, n], for a `Pace`; None where nobody knows.
 
     Raises:
         ValueError: a model or an update that it cannot serve: says why.
@@ -85,6 +84,7 @@ class SpanCarrier(Carrier):
         self.memory = update.complete(state.memory, start)
         self.batch_shape, m = tuple(start.shape[:-2]), part.moving
         seen = view.state[m:] - m
+        first = None if first is None else first - state.centre.unsqueeze(-2)
         self._columns = ColumnMembers(start, seen, m, first)
         self.matrix, self._moving = self._columns.matrix, self._columns.moving
         self._advance = part.dynamics.advancer(self._moving)
@@ -186,9 +186,13 @@ class SpanCarrier(Carrier):
             torch.index_select(draws, -1, plan.dofs, out=plan.draws)
         elif perturbs:
             fill_standard_normal(plan.draws, self._generator)
-        self._place(plan, y, mask)
-        sample = self._measure(plan, y, mask)
-        return analyse(self._slots, self, sample, plan.draws_by_dof if perturbs else None)
+        before, former = self.memory, self._place(plan, y, mask)
+        try:
+            sample = self._measure(plan, y, mask)
+            return analyse(self._slots, self, sample, plan.draws_by_dof if perturbs else None)
+        except ValueError:  # a sample that cannot be taken in leads nobody
+            self.restore(self.matrix if former is None else former, before)
+            raise
 
     def expected(self) -> Tensor:
         """See `Carrier.expected`."""
@@ -215,7 +219,7 @@ class SpanCarrier(Carrier):
         S = torch.add(R, products, alpha=self._share)
         factor, info = torch.linalg.cholesky_ex(S)
         if bool(info.any() if self.batch_shape else info):
-            self._explain(S, plan)
+            explain(S, plan.dofs, self._whole)
         residual = torch.sub(y, plan.mean_by_dof, out=plan.residual)
         if seen is not None:
             residual.masked_fill_(~seen, 0)
@@ -262,19 +266,22 @@ class SpanCarrier(Carrier):
         self._measured = Measured(plan.values, observed, deviations, plan.rows)
         return self._measured
 
-    def _place(self, plan: Plan, y: Tensor, mask: Tensor | None) -> None:
-        """Lead the members where the pace has them, now that a sample was seen."""
+    def _place(self, plan: Plan, y: Tensor, mask: Tensor | None) -> Tensor | None:
+        """Lead the members where the pace has them, now that a sample was seen; what they were, if they were led."""
         pace, memory = self._slots.pace, self.memory
         if pace is None or memory.pace is None:
-            return
+            return None
         observed = None if mask is None else mask.index_select(-1, plan.dofs)
         values = y.index_select(-1, plan.dofs)
         seen = Seen(values, observed, None, plan.rows, self.moving, self.mean, memory.origin)
         remembered, placement = pace.notice(memory.pace, seen)
         self.memory = memory._replace(pace=remembered)
-        if placement is not None:
-            place_columns(self._columns, self.mean, placement)
-            self._mean = None
+        if placement is None:
+            return None
+        former = self.matrix.clone()
+        place_columns(self._columns, self.mean, placement)
+        self._mean = None
+        return former
 
     def _believed(self, plan: Plan) -> tuple[Tensor, Tensor, Tensor]:
         """R of a plan's DoFs, kept while no parameter changes, unless it depends on the state."""
@@ -291,9 +298,3 @@ class SpanCarrier(Carrier):
         """What each member counts in a mean, [..., E, 1]."""
         weighting = self.memory.weighting
         return self._equal if weighting is None else weighting.weights.unsqueeze(-1)
-
-    def _explain(self, S: Tensor, plan: Plan) -> None:
-        try:
-            cholesky(S, plan.dofs)
-        except FactorisationError as error:
-            raise self._whole.named(error, None) from error

@@ -10,26 +10,34 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
 from torch_ebip.common.brief import brief
 from torch_ebip.filtering.updates.part import Part
 from torch_ebip.filtering.updates.weighting import Seen
 
+GOLDEN = 0.6180339887498949
+"""Multiples of it, less their whole part, are evenly spread."""
+
 
 class Placement(NamedTuple):
-    """Where members are led: the first of their entries that move, x, becomes mean + offset + stretch (x - mean).
+    """Where members are led: a share of the first of their entries that move, x, is there, the rest where it was.
 
-    What stands still was learned where a sequence was not: of it a share becomes what it was at first.
+    x becomes mean + offset + (1 - share) (x - mean) + share deviation z, z evenly spread quantiles of a normal
+    distribution: members may all have been at one place. What stands still was learned where a sequence was not: of
+    it a share becomes what it was at first.
 
     Attributes:
         offset: [...].
-        stretch: [...], not negative.
+        share: [...], in [0, 1].
+        deviation: [...].
         renewed: [...], in [0, 1].
     """
 
     offset: Tensor
-    stretch: Tensor
+    share: Tensor
+    deviation: Tensor
     renewed: Tensor
 
     def __repr__(self) -> str:
@@ -63,5 +71,13 @@ class Pace(Part, ABC):
 
 def led(first: Tensor, mean: Tensor, placement: Placement) -> Tensor:
     """The first entry [..., E] of members, with a mean [...], where a placement leads it."""
-    apart = (first - mean.unsqueeze(-1)) * placement.stretch.unsqueeze(-1)
-    return apart + (mean + placement.offset).unsqueeze(-1)
+    share, mean = placement.share.unsqueeze(-1), mean.unsqueeze(-1)
+    there = placement.deviation.unsqueeze(-1) * quantiles(first.shape[-1], first)
+    return mean + placement.offset.unsqueeze(-1) + torch.lerp(first - mean, there, share)
+
+
+def quantiles(count: int, like: Tensor) -> Tensor:
+    """[E], of a normal distribution, evenly spread, in no order that states of a prior might have; mean 0."""
+    place = (torch.arange(count, device=like.device, dtype=torch.float64) * GOLDEN).remainder(1).argsort().argsort()
+    found: Tensor = torch.special.ndtri((place + 0.5) / count).to(like)
+    return found

@@ -33,17 +33,17 @@ def placement_of(
     Args:
         belief: of the bank: mean and deviation of the phase, [...].
         strange: [...], squared distance from all that was demonstrated, 1 for what is usual.
-        some: bool [...], the entries of a batch of which there is news.
+        some: [...], in [0, 1], how much news there is of each entry of a batch.
         seen: the sample, and the members.
         agree: [], deviations up to which the ensemble is believed.
     """
     mean, deviation = belief
-    spread = seen.moving[..., 0].var(-1, correction=0).sqrt()
+    variance = seen.moving[..., 0].var(-1, correction=0)
     apart = mean - seen.mean[..., 0]
-    far = apart.abs() / (deviation.square() + spread.square() + FLOOR**2).sqrt()
+    far = apart.abs() / (deviation.square() + variance + FLOOR**2).sqrt()
     known = ((STRANGE[1] - strange) / (STRANGE[1] - STRANGE[0])).clamp(0, 1)
     share = ((far - agree) / DIFFER).clamp(0, 1) * known * some
     if not bool((share > 0).any()):
         return None
-    wider = torch.clamp(deviation / spread.clamp(min=1e-6), min=1)
-    return Placement(share * apart, 1 + share * (wider - 1), share * (apart.abs() / ANEW).clamp(max=1))
+    wide = torch.maximum(deviation.square(), variance).sqrt()
+    return Placement(share * apart, share, wide, share * (apart.abs() / ANEW).clamp(max=1))

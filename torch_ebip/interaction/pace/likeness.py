@@ -16,6 +16,10 @@ from torch_ebip.interaction.table import DemonstrationTable
 
 CAP = 16.0
 """Largest squared distance of a sensor, in units of what is usual: more is a sensor that lies, or a stranger."""
+STILL = 1e-6
+"""Of the size of a DoF's values: what spreads by less is what regressions round."""
+FARTHEST = 1e3
+"""Usual deviations beyond which all is equally absurd."""
 SLOPE_WINDOW = 0.05
 """s, over which velocities are measured, about: noise of samples makes them uncertain."""
 
@@ -41,6 +45,7 @@ class Likeness(nn.Module):
     blocks: Tensor
     precision: Tensor
     middle: Tensor
+    farthest: Tensor
     order: Tensor
     phases: Tensor
 
@@ -73,6 +78,7 @@ class Likeness(nn.Module):
             ("blocks", blocks),
             ("middle", placed[0].view(S, w)),
             ("precision", placed[1:].view(2, S, w)),
+            ("farthest", FARTHEST / placed[1:].view(2, S, w).clamp(min=torch.finfo(values.dtype).tiny).sqrt()),
             ("order", order.view(S, w)),
             ("phases", torch.linspace(0, 1, P, dtype=values.dtype, device=values.device)),
         ):
@@ -91,6 +97,8 @@ class Likeness(nn.Module):
         """
         R, S, _ = apart.shape
         known = known * (self.precision > 0).unsqueeze(1)
+        # Squares of what is absurd would be infinite, and their differences nothing.
+        apart, velocity = (part.clamp(-far, far) for part, far in zip((apart, velocity), self.farthest, strict=True))
         shares = known / known.sum(-1, keepdim=True).clamp(min=1)
         w, v = (self.precision.unsqueeze(1) * (strength[:, None, None, None] * shares)).unbind()
         wx, vu, none = w * apart, v * velocity, torch.zeros_like(w)
@@ -123,6 +131,9 @@ def likeness_of(primitive: InteractionPrimitive, phases: int, most: int) -> tupl
         primitive: of the demonstrations.
         phases: P, evenly from 0 to 1.
         most: N at most.
+
+    Raises:
+        ValueError: no sensor moves.
     """
     table = DemonstrationTable.of(primitive, phases)
     layout = primitive.layout
@@ -130,7 +141,9 @@ def likeness_of(primitive: InteractionPrimitive, phases: int, most: int) -> tupl
     values = table.values[..., dofs]
     velocities = table.slopes[..., dofs] * primitive.phase_velocity[:, None, None]
     spread = values.flatten(0, 1).std(0)
-    moves = spread > 0
+    moves = spread > STILL * values.abs().amax((0, 1))
+    if not bool(moves.any()):
+        raise ValueError("a phase bank compares sensors that move: in these demonstrations none does")
     dofs, values, velocities, spread = dofs[moves], values[..., moves], velocities[..., moves], spread[moves]
     sensors = layout.modality_of_dof.to(dofs.device)[dofs]
     _, sensors = torch.unique(sensors, return_inverse=True)

@@ -40,8 +40,9 @@ LEAST_COUNT = 0.02
 """What a sample of a person who stands still counts at least."""
 FIRST, DUE, NEARLY = 0.9996, 0.9995, 0.0002
 """Of a period: on the clock at the start, when a step is due, and by how much rounded sums of times may be short."""
-SHORTEST = 1e-3
-"""s, between two values that have a velocity."""
+SHORTEST, WIDEST = 1e-3, 0.3
+"""s, between two values that have a velocity: over longer gaps it is none of the present. Bank and samples may be far
+apart in time: periods are `LONGEST` at most, and thinned recordings have less than that many samples."""
 HELD = 0.4, 0.8
 """Probability of standing still from which on the ensemble's clock is held, and from which on altogether: it would be
 behind if it were held a little all the time."""
@@ -67,6 +68,7 @@ class PhaseBank(Pace):
         pace: [N], v_j, 1/s.
         which: int64 [N], which of the prior's states they are.
         n_dofs: D, of the layout.
+        n_all: how many states the prior has.
         stop: times a second that a person stops.
         go: times a second that one who stands goes on.
         jump: times a second that a person starts over, or is somewhere else.
@@ -90,6 +92,7 @@ class PhaseBank(Pace):
         pace: Tensor,
         which: Tensor,
         n_dofs: int,
+        n_all: int,
         stop: float = 0.3,
         go: float = 1.0,
         jump: float = 0.02,
@@ -109,7 +112,7 @@ class PhaseBank(Pace):
         self.likeness = likeness
         self.register_buffer("settings", pace.new_tensor(list(numbers.values())))
         self.register_buffer("which", owned(which), persistent=False)
-        self.n_dofs = n_dofs
+        self.n_dofs, self.n_all = n_dofs, n_all
         self.register_buffer("columns", torch.arange(n_dofs, device=pace.device), persistent=False)
         moves = transition_of(pace, likeness.n_phases, self.period)
         self.register_buffer("transition", moves, persistent=False)
@@ -128,7 +131,9 @@ class PhaseBank(Pace):
         likeness, which = likeness_of(primitive, as_count("phases", phases, 2), as_count("most", most, 1))
         usual = 1 / float(primitive.phase_velocity.mean())
         settings = {"period": min(LONGEST, usual / STEPS), **settings}
-        return cls(likeness, primitive.phase_velocity[which], which, primitive.layout.n_dofs, **settings)
+        return cls(
+            likeness, primitive.phase_velocity[which], which, primitive.layout.n_dofs, len(primitive), **settings
+        )
 
     def check(self, model: StateSpace) -> None:
         """See `Part.check`: it is for as many DoFs as the model has."""
@@ -146,7 +151,7 @@ class PhaseBank(Pace):
         batch, N = members.shape[:-2], len(self.which)
         own = members.new_ones(*batch, N)
         if origin is not None:
-            count = 1 + max(int(self.which.max()), int(origin.max()))
+            count = self.n_all
             there = members.new_zeros(*batch, count).scatter(-1, origin.expand(*batch, -1), 1.0)
             own = there.index_select(-1, self.which)
             own = torch.where(own.any(-1, keepdim=True), own, 1.0)  # none of the bank's: then all
@@ -198,7 +203,7 @@ class PhaseBank(Pace):
         if not bool(some.any()):
             return kept, None
         steps = (memory.clock / self.period + NEARLY).floor()
-        weight, distance = self._weight(kept)
+        weight, distance, moves = self._weight(kept)
         share = self._passed(memory, steps) * weight
         share = share / share.sum((-2, -1), keepdim=True)
         moments = share.sum(-2) @ self._moves().moments
@@ -208,7 +213,9 @@ class PhaseBank(Pace):
             stepped = Whereabouts(*(chosen(some, new, old) for new, old in zip(stepped, kept, strict=True)))
         P = distance.shape[-1]
         strange = ((share[..., :P] + share[..., P:]) * distance).sum((-2, -1))
-        return stepped, placement_of(belief_of(moments, self.likeness.phases), strange, some, seen, self.settings[6])
+        # Where somebody is whose velocity nobody knows is guessed: after a silence the ensemble knows better.
+        news = some * moves
+        return stepped, placement_of(belief_of(moments, self.likeness.phases), strange, news, seen, self.settings[6])
 
     def _summed(self, memory: Whereabouts, seen: Seen) -> Tensor:
         """Sums [..., 3, D] with a sample."""
@@ -233,9 +240,9 @@ class PhaseBank(Pace):
             share = after if alike else torch.where((k < steps)[..., None, None], after, share)
         return share
 
-    def _weight(self, memory: Whereabouts) -> tuple[Tensor, Tensor]:
-        """[..., N, 2 P], what each hypothesis makes of the samples that a memory holds, the best has 1; and how far
-        they are from each, [..., N, P]."""
+    def _weight(self, memory: Whereabouts) -> tuple[Tensor, Tensor, Tensor]:
+        """[..., N, 2 P], what each hypothesis makes of the samples that a memory holds, the best has 1; how far they
+        are from each, [..., N, P]; and the share of the DoFs seen whose velocity is known, [...]."""
         like, D = self.likeness, self.n_dofs
         batch = memory.clock.shape
         both = torch.cat([memory.sums, memory.before], -2).view(-1, 6, D)
@@ -243,12 +250,14 @@ class PhaseBank(Pace):
         number, time, value, former, older, before = placed.unbind(1)
         there, number = number.clamp(max=1), number.clamp(min=1)
         value, gap = value / number, time / number + older
-        moves = there * former * (gap > SHORTEST)
+        moves = there * former * ((gap > SHORTEST) & (gap < WIDEST))
         velocity = moves * (value - before) / gap.clamp(min=SHORTEST)
         strength = self.period * self.settings[3:5]
         log, distance = like(there * (value - like.middle), velocity, torch.stack([there, moves]), strength)
         weight = torch.exp(log - log.amax((-2, -1), keepdim=True))
-        return weight.view(*batch, *log.shape[-2:]), distance.view(*batch, *distance.shape[-2:])
+        real = like.precision[0] > 0
+        share = (moves * real).sum((-2, -1)) / (there * real).sum((-2, -1)).clamp(min=1)
+        return weight.view(*batch, *log.shape[-2:]), distance.view(*batch, *distance.shape[-2:]), share.view(batch)
 
     def belief(self, memory: Whereabouts) -> tuple[Tensor, Tensor]:
         """Mean and deviation of the phase, [...] each, by what the bank remembers."""

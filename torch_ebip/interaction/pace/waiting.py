@@ -8,9 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_ebip.common.brief import brief
-
-GOLDEN = 0.6180339887498949
-"""Multiples of it, less their whole part, are evenly spread: in no order that demonstrations might have."""
+from torch_ebip.filtering.updates.pace import GOLDEN
 
 
 class Waits(NamedTuple):
@@ -34,10 +32,10 @@ class Waits(NamedTuple):
 
     def gone(self, seconds: Tensor) -> Tensor:
         """[..., P], s, how long of so many seconds [P] they go, on the average; of infinity, infinity."""
-        end = seconds.isinf()
-        finite = torch.where(end, 0, seconds)
+        plain = seconds.isinf() | (seconds < 0)  # what is past is past
+        finite = torch.where(plain, 0, seconds)
         after = finite - (1 - torch.exp(-self.go * finite)) / self.go
-        return torch.where(end, seconds, torch.lerp(finite, after, self.held.unsqueeze(-1)))
+        return torch.where(plain, seconds, torch.lerp(finite, after, self.held.unsqueeze(-1)))
 
     def gone_apart(self, seconds: Tensor, count: int) -> Tensor:
         """[..., P, E], s, the same in a case of its own for each of E members: it goes, or waits a time of its own.
