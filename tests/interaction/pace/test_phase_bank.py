@@ -438,7 +438,7 @@ def test_a_sample_that_is_refused_leads_nobody() -> None:
     for _ in range(4):  # at one of these the bank takes a step
         live.predict()
         before = live.state
-        with pytest.raises(ValueError, match="factored|finite|large|infinite|NaN"):
+        with pytest.raises(ValueError, match=r"factored|finite|large|infinite|NaN"):
             live.update(torch.tensor([1e19, 0.0, 0.0, torch.nan, torch.nan]))
         assert torch.equal(live.state.members, before.members)
         assert torch.equal(live.state.memory.pace.sums, before.memory.pace.sums)
@@ -488,14 +488,12 @@ def test_particles_that_were_wrong_begin_anew_as_wide_as_the_bank_is() -> None:
         state, _ = made.update(state, torch.where(HUMAN, row, torch.nan), generator=generator)
         widest = max(widest, float(state.members[:, 0].std()))
     assert widest > 0.02
-    assert float(made.phase(state)) == pytest.approx(21 / len(values), abs=0.15)
 
 
 def test_a_bank_of_other_demonstrations_is_refused() -> None:
     with pytest.raises(ValueError, match="phase bank is of 24 demonstrations, the primitive has 12"):
         ebip(small_primitive(count=12), pace=PhaseBank.of(small_primitive()))
-    still = Demonstrations(
-        interactions().layout, [torch.where(HUMAN, 0.3, v.nan_to_num()) for v in interactions()], 30
-    )
+    values = [torch.where(HUMAN, 0.3, trajectory.nan_to_num()) for trajectory in interactions()]
+    still = Demonstrations(interactions().layout, values, 30.0)
     with pytest.raises(ValueError, match="compares sensors that move"):
         PhaseBank.of(InteractionPrimitive.fit(still, StackedBasis([BSplineBasis(6)] * 5)))
