@@ -50,8 +50,8 @@ def learn_pace(
 
     Returns:
         ``used``, ``sharpness`` and ``agree``, and the CRPS over all horizons and DoFs, in units of the targets'
-        spread, ``with`` and ``without`` it, of interactions ``undisturbed`` and ``interrupted`` (the latter ``with`` a
-        bank only where that may be used); or a ``reason``.
+        spread, ``with`` and ``without`` it, of interactions ``undisturbed`` and ``interrupted``, the latter ``with``
+        a bank only where it may be used; or a ``reason``.
     """
     task = held_out.task
     primitive = task.primitive
