@@ -59,8 +59,8 @@ def bent() -> InteractionModel:
     return learn(bending(60), **QUICK)
 
 
-def the_file_says_the_same(model: InteractionModel, y: torch.Tensor, folder: Path) -> None:
-    """Of a recording at horizons and between them; and a session of it forecasts."""
+def the_file_says_the_same(model: InteractionModel, y: torch.Tensor, folder: Path) -> InteractionModel:
+    """Of a recording at horizons and between them; and a session of it forecasts. What the file holds."""
     model.save(folder / "model.safetensors")
     again, ahead = InteractionModel.load(folder / "model.safetensors"), [0.1, 0.7, math.inf]
     for ours, theirs in zip(model.forecast(y, ahead)[:2], again.forecast(y, ahead)[:2], strict=True):
@@ -69,6 +69,7 @@ def the_file_says_the_same(model: InteractionModel, y: torch.Tensor, folder: Pat
     for i, row in enumerate(y[:20]):
         session.push("hand", row[:2].tolist(), i / 30)
     assert session.forecast().mean.isfinite().all()
+    return again
 
 
 def error(model: InteractionModel, tests: Demonstrations, share: float = 0.7) -> float:
@@ -126,7 +127,9 @@ def test_who_knows_little_is_not_sure(bent: InteractionModel) -> None:
 
 
 def test_they_are_kept_in_the_file_and_say_the_same(bent: InteractionModel, tmp_path: Path) -> None:
-    the_file_says_the_same(bent, bending(1, seed=3)[0], tmp_path)
+    again = the_file_says_the_same(bent, bending(1, seed=3)[0], tmp_path)
+    for ours, theirs in zip(bent.filter.readout.parameters(), again.filter.readout.parameters(), strict=True):
+        assert torch.equal(ours, theirs)
 
 
 def test_a_model_that_grows_compares_with_the_new_ones_too(bent: InteractionModel) -> None:

@@ -86,14 +86,19 @@ def at_speed(factor: float) -> Interruption:
 
     def made(values: Tensor, rate: float, noise: Tensor, generator: torch.Generator) -> Interrupted:
         """The same way on another clock."""
-        last = len(values) - 1
-        place = (torch.arange(int(last / factor) + 1, dtype=torch.float64) * factor).clamp(max=last)
-        low = place.floor().long().clamp(max=max(last - 1, 0))
-        part = (place - low).to(values).unsqueeze(-1)
-        moved = torch.lerp(values[low], values[(low + 1).clamp(max=last)], part)
+        moved, place = played_at(values, factor)
         return Interrupted(moved, place.round().long(), 0)
 
     return made
+
+
+def played_at(values: Tensor, speed: float) -> tuple[Tensor, Tensor]:
+    """A recording [T, D] so many times as fast on the same clock, [T', D], and where in it each sample is, [T']."""
+    last = len(values) - 1
+    place = (torch.arange(int(last / speed) + 1, dtype=torch.float64) * speed).clamp(max=last)
+    low = place.floor().long().clamp(max=max(last - 1, 0))
+    part = (place - low).to(values).unsqueeze(-1)
+    return torch.lerp(values[low], values[(low + 1).clamp(max=last)], part), place
 
 
 def undisturbed(values: Tensor, rate: float, noise: Tensor, generator: torch.Generator) -> Interrupted:

@@ -24,6 +24,7 @@ from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.interaction.readout import hats
 from torch_ebip.interaction.table import DemonstrationTable
 from torch_ebip.learning.held_out import HeldOut
+from torch_ebip.learning.interruptions import played_at
 from torch_ebip.learning.metrics import Z95
 from torch_ebip.learning.partition import Partition, generator_of
 from torch_ebip.learning.said import Said, what_it_says
@@ -66,13 +67,7 @@ def unlikeness(primitive: InteractionPrimitive) -> Tensor:
 
 def played(demonstrations: Demonstrations, speed: float) -> Demonstrations:
     """The same movements at another speed, on the same clock; between samples linear, NaN beside NaN."""
-    trajectories = []
-    for trajectory in demonstrations:
-        last = len(trajectory) - 1
-        place = (torch.arange(int(last / speed) + 1, dtype=torch.float64) * speed).clamp(max=last)
-        low = place.floor().long().clamp(max=max(last - 1, 0))
-        part = (place - low).to(trajectory).unsqueeze(-1)
-        trajectories.append(torch.lerp(trajectory[low], trajectory[(low + 1).clamp(max=last)], part))
+    trajectories = [played_at(trajectory, speed)[0] for trajectory in demonstrations]
     return Demonstrations(demonstrations.layout, trajectories, demonstrations.rate)
 
 

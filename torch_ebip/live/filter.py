@@ -195,8 +195,7 @@ class LiveFilter:
     @torch.no_grad()
     def waits(self) -> Waits | None:
         """Whether the person stands still; None where nobody looks."""
-        pace, memory = self.filter.pace, self.carrier.memory
-        return None if pace is None or memory.pace is None else pace.waits(memory.pace)
+        return self.filter.waits(self.carrier)
 
     @property
     def counts(self) -> Tensor | None:

@@ -25,6 +25,7 @@ from torch_ebip import (
     particle_filter,
 )
 from torch_ebip.filtering.updates.weighting import Seen
+from torch_ebip.interaction.pace.leading import placement_of
 from torch_ebip.interaction.pace.likeness import CAP
 from torch_ebip.interaction.pace.moves import CHANCES, RATES, transition_of
 from torch_ebip.interaction.pace.phase_bank import IDLE
@@ -473,6 +474,20 @@ def test_a_silence_of_all_sensors_costs_nothing() -> None:
                 trace = made(shown[:stop], generator=torch.Generator().manual_seed(0))
             found.append(float((trace.phase[-4:] - phase[stop - 4 : stop]).abs().mean()))
     assert np.mean(errors[True]) < np.mean(errors[False]) + 0.02
+
+
+def test_who_moves_as_nobody_did_is_left_to_the_ensemble() -> None:
+    """Six usual deviations from all demonstrations nobody is led, however far the phases are apart."""
+    deviation, agree = torch.tensor(0.02).double(), torch.tensor(1.0).double()
+    moving = torch.zeros(24, 2).double()
+    seen = Seen(torch.zeros(3).double(), None, None, None, moving, moving.mean(0), None)
+    belief, one = (torch.tensor(0.5).double(), deviation), torch.tensor(1.0).double()
+    usual, strange = (placement_of(belief, torch.tensor(far).double(), one, seen, agree) for far in (1.0, 6.0))
+    assert strange is None
+    assert usual is not None
+    assert float(usual.share) == 1.0
+    assert float(usual.offset) == 0.5
+    assert placement_of(belief, one, torch.tensor(0.0).double(), seen, agree) is None  # nor where there is no news
 
 
 def test_particles_that_were_wrong_begin_anew_as_wide_as_the_bank_is() -> None:

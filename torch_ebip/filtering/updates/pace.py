@@ -8,6 +8,7 @@ members back that are lost.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import torch
@@ -78,6 +79,12 @@ def led(first: Tensor, mean: Tensor, placement: Placement) -> Tensor:
 
 def quantiles(count: int, like: Tensor) -> Tensor:
     """[E], of a normal distribution, evenly spread, in no order that states of a prior might have; mean 0."""
-    place = (torch.arange(count, device=like.device, dtype=torch.float64) * GOLDEN).remainder(1).argsort().argsort()
-    found: Tensor = torch.special.ndtri((place + 0.5) / count).to(like)
-    return found
+    return _quantiles(count, like.dtype, like.device)
+
+
+@lru_cache(maxsize=16)
+def _quantiles(count: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    with torch.inference_mode(False):  # kept: whatever the caller's mode, others may need gradients
+        place = (torch.arange(count, device="cpu", dtype=torch.float64) * GOLDEN).remainder(1).argsort().argsort()
+        found: Tensor = torch.special.ndtri((place + 0.5) / count).to(device, dtype)
+        return found

@@ -151,8 +151,7 @@ class PhaseBank(Pace):
         batch, N = members.shape[:-2], len(self.which)
         own = members.new_ones(*batch, N)
         if origin is not None:
-            count = self.n_all
-            there = members.new_zeros(*batch, count).scatter(-1, origin.expand(*batch, -1), 1.0)
+            there = members.new_zeros(*batch, self.n_all).scatter(-1, origin.expand(*batch, -1), 1.0)
             own = there.index_select(-1, self.which)
             own = torch.where(own.any(-1, keepdim=True), own, 1.0)  # none of the bank's: then all
         own = own / own.sum(-1, keepdim=True)
