@@ -512,3 +512,31 @@ def test_a_bank_of_other_demonstrations_is_refused() -> None:
     still = Demonstrations(interactions().layout, values, 30.0)
     with pytest.raises(ValueError, match="compares sensors that move"):
         PhaseBank.of(InteractionPrimitive.fit(still, StackedBasis([BSplineBasis(6)] * 5)))
+
+
+def test_after_a_silence_nobody_is_led_before_velocities_are_known() -> None:
+    """The ensemble of `seen_of` says phase 0: it is led at once, but not by the first sample after a second's gap."""
+    bank = PhaseBank.of(small_primitive(torch.float64))
+    memory = bank.start(torch.zeros(24, 3).double(), None)
+    led = []
+    for row, gap in zip(
+        interactions(3, seed=77, dtype=torch.float64)[1][6:18], [0.06] * 6 + [1.0] + [0.06] * 5, strict=True
+    ):
+        memory, _ = bank.elapse(memory, torch.tensor(gap).double())
+        memory, placement = bank.notice(memory, seen_of(row))
+        led.append(placement is not None)
+    assert led[5]
+    assert not led[6]
+    assert led[8]
+
+
+def test_samples_of_who_stands_count_less_in_the_update() -> None:
+    made = paced(torch.float64)
+    row = torch.where(HUMAN, interactions(3, seed=77, dtype=torch.float64)[1][1], torch.nan)
+    start = made.initial_state()
+    spreads = []
+    for standing in (0.1, 0.95):
+        pace = start.memory.pace._replace(clock=torch.tensor(0.0).double(), standing=torch.tensor(standing).double())
+        state, _ = made.update(start._replace(memory=start.memory._replace(pace=pace)), row)
+        spreads.append(float(state.deviations[:, 2:].std(0).mean()))
+    assert spreads[1] > 1.02 * spreads[0]
