@@ -78,6 +78,9 @@ def test_smaller_and_larger_ensembles(size: int) -> None:
     members = tuner.partition.members(torch.arange(6), torch.Generator().manual_seed(0))
     assert members.shape == (6, size)
     assert not (members == torch.arange(6)[:, None]).any()
+    known = tuner.partition.known(torch.arange(6))
+    assert known.gather(1, members).all()
+    assert not known[:, :6].diagonal().any()
 
 
 def test_tuning_improves_the_validation_loss_and_moves_the_noise() -> None:

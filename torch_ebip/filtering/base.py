@@ -68,7 +68,9 @@ class Filter(Meaning, ABC):
         return self.model.stride
 
     @abstractmethod
-    def _start(self, batch_shape: tuple[int, ...], chosen: Tensor | None, generator: Generators) -> State:
+    def _start(
+        self, batch_shape: tuple[int, ...], chosen: Tensor | None, generator: Generators, known: Tensor | None
+    ) -> State:
         """`initial_state` with arguments that were checked."""
 
     @abstractmethod
@@ -94,6 +96,7 @@ class Filter(Meaning, ABC):
         generator: Generators = None,
         *,
         members: Tensor | None = None,
+        known: Tensor | None = None,
     ) -> State:
         """The state before any observation.
 
@@ -102,6 +105,7 @@ class Filter(Meaning, ABC):
             demonstrations: int64 [..., E], which of the prior's form the ensemble; default: see the prior.
             generator: of the draws.
             members: int64 [..., E], the old name of ``demonstrations``.
+            known: bool [..., N], what of the prior a `Pace` may know; default: all, or the demonstrations if given.
 
         Raises:
             ValueError: a demonstration that there is not, or shapes that do not broadcast.
@@ -109,7 +113,7 @@ class Filter(Meaning, ABC):
         if members is not None:
             warnings.warn("initial_state(members=) is now called demonstrations=", DeprecationWarning, stacklevel=2)
             demonstrations = members
-        return eager(self._start)(batch_shape, demonstrations, generator)
+        return eager(self._start)(batch_shape, demonstrations, generator, known)
 
     def restrict(self, dofs: Tensor, stride: int = 1) -> Self:
         """The same filter for some of the DoFs, sharing its parameters: not a copy.
@@ -176,11 +180,7 @@ class Filter(Meaning, ABC):
 
     @eager
     def update(
-        self,
-        state: State,
-        y: Tensor,
-        observed: Tensor | None = None,
-        generator: Generators = None,
+        self, state: State, y: Tensor, observed: Tensor | None = None, generator: Generators = None
     ) -> tuple[State, Tensor]:
         """Take in one sample.
 
@@ -232,9 +232,8 @@ class Filter(Meaning, ABC):
                 T / segment + segment instead of T, at the price of a second forward pass. Exact: every
                 segment is recomputed with the draws it had.
             project: whether to compute `Trace.projection`.
-            engine: who holds the members: "dense", which gradients pass through; "span", in place, where the model
-            and
-                the update allow it; "auto", the second where no gradients are recorded and it can serve.
+            engine: who holds the members: "dense", which gradients pass through; "span", in place, where model and
+                update allow it; "auto", the second where no gradients are recorded and it can serve.
 
         Raises:
             ValueError: wrong shapes or dtypes, NaN or infinity where observed, a step to keep that there is not, a dt

@@ -56,10 +56,15 @@ class EnsembleFilter(MemberFilter):
         for part in self.analysis.parts:
             part.check(model)
 
-    def _start(self, batch_shape: tuple[int, ...], chosen: Tensor | None, generator: Generators) -> EnsembleState:
+    def _start(
+        self, batch_shape: tuple[int, ...], chosen: Tensor | None, generator: Generators, known: Tensor | None
+    ) -> EnsembleState:
         """Step 1 of the paper's algorithm."""
         members, origin = self._members(batch_shape, chosen, generator)
-        return taken_out(self.model, EnsembleState(members, self.analysis.start(members, origin)))
+        memory = self.analysis.start(members, origin)
+        if self.analysis.pace is not None:
+            memory = memory._replace(pace=self._paced(self.analysis.pace, members, chosen, known))
+        return taken_out(self.model, EnsembleState(members, memory))
 
     def _predict(self, state: EnsembleState, dt: Tensor, generator: Generators) -> EnsembleState:
         """Step 2: x = g(x) + N(0, Q)."""

@@ -86,7 +86,9 @@ class ExtendedFilter(Filter):
                 raise ValueError(f"an extended filter needs derivatives: a {type(part).__name__} has no `{method}`")
         self.trust = nn.ModuleList(trust)
 
-    def _start(self, batch_shape: tuple[int, ...], chosen: Tensor | None, generator: Generators) -> GaussianState:
+    def _start(
+        self, batch_shape: tuple[int, ...], chosen: Tensor | None, generator: Generators, known: Tensor | None
+    ) -> GaussianState:
         """The equations of mu_0 and Sigma_0."""
         return GaussianState(*self.prior(batch_shape, chosen))
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
+import torch
 from torch import Tensor, nn
 
 from torch_ebip.common.ambient import eager
@@ -12,6 +13,7 @@ from torch_ebip.common.draws import Generators
 from torch_ebip.filtering.base import Filter
 from torch_ebip.filtering.model import StateSpace
 from torch_ebip.filtering.states import State
+from torch_ebip.filtering.updates.pace import Pace
 
 
 @runtime_checkable
@@ -55,6 +57,12 @@ class MemberFilter(Filter):
         if isinstance(self.prior, NumbersItsStates):
             return self.prior.start(batch_shape, self.n_members, chosen, generator)
         return self.prior(batch_shape, self.n_members, chosen, generator), None
+
+    def _paced(self, pace: Pace, members: Tensor, chosen: Tensor | None, known: Tensor | None) -> Any:
+        """What a pace remembers at first; see `Filter.initial_state`."""
+        if known is not None and known.dtype is not torch.bool:
+            raise ValueError(f"known must be bool [..., N], got {known.dtype} {list(known.shape)}")
+        return pace.start(members, None if known is not None else chosen, known)
 
     def _centre(self, state: State) -> Tensor | None:
         """What the members of a state are deviations from, [..., n]; None if they are none."""

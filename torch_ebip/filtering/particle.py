@@ -106,11 +106,13 @@ class ParticleFilter(MemberFilter):
         if pace is not None:
             pace.check(model)
 
-    def _start(self, batch_shape: tuple[int, ...], chosen: Tensor | None, generator: Generators) -> ParticleState:
+    def _start(
+        self, batch_shape: tuple[int, ...], chosen: Tensor | None, generator: Generators, known: Tensor | None
+    ) -> ParticleState:
         """Equal weights."""
-        started, origin = self._members(batch_shape, chosen, generator)
+        started, _ = self._members(batch_shape, chosen, generator)
         count = started.shape[-2]
-        pace = None if self.pacing is None else self.pacing.start(started, origin)
+        pace = None if self.pacing is None else self._paced(self.pacing, started, chosen, known)
         return ParticleState(started, started.new_full(started.shape[:-1], -math.log(count)), pace)
 
     def _predict(self, state: ParticleState, dt: Tensor, generator: Generators) -> ParticleState:

@@ -167,7 +167,8 @@ class HeldOut:
         """
         draws = [seeded(self.settings.seed, key, interaction) for interaction in shown.interactions.tolist()]
         part = filter.restrict(shown.dofs, self.settings.thinning)
-        state = part.initial_state((len(shown.interactions),), shown.members, draws)
+        known = self.partition.known(shown.interactions.cpu()).to(shown.members.device)
+        state = part.initial_state((len(shown.interactions),), shown.members, draws, known=known)
         segment = self.settings.segment if torch.is_grad_enabled() else None
         trace = part(
             shown.y,

@@ -43,6 +43,10 @@ class Partition:
         """int64 [N], all demonstrations, those that decide when to stop first."""
         return torch.cat([self.validating, self.training])
 
+    def known(self, interactions: Tensor) -> Tensor:
+        """bool [B, N], which demonstrations those may know that filter some interactions, int64 [B]."""
+        return self.fold_of != self.fold_of[interactions].unsqueeze(-1)
+
     def members(self, interactions: Tensor, generator: torch.Generator) -> Tensor:
         """Indices [B, E] of demonstrations outside the fold of each of some interactions, int64 [B]."""
         others, size = self._others[self.fold_of[interactions]], self._size

@@ -222,6 +222,32 @@ def test_nothing_is_known_of_a_demonstration_that_is_not_a_member() -> None:
     assert float(share.sum()) == pytest.approx(1)
 
 
+def test_a_small_ensemble_does_not_make_a_bank_forget_the_others() -> None:
+    primitive = small_primitive()
+    filter = ebip(primitive, n_members=4, square_root=True, pace=PhaseBank.of(primitive))
+    everyone = torch.ones(24, dtype=torch.bool)
+
+    def hypotheses(**options: torch.Tensor) -> torch.Tensor:
+        return filter.initial_state(
+            (2,), generator=torch.Generator().manual_seed(0), **options
+        ).memory.pace.share.sum(-1)
+
+    torch.testing.assert_close(hypotheses(), torch.full((2, 24), 1 / 24))
+    chosen = torch.tensor([[1, 2, 3, 3], [4, 5, 6, 7]])
+    assert [row.nonzero().flatten().tolist() for row in hypotheses(demonstrations=chosen)] == [
+        [1, 2, 3],
+        [4, 5, 6, 7],
+    ]
+    without = everyone.clone()
+    without[9] = False
+    found = hypotheses(demonstrations=chosen, known=without)
+    torch.testing.assert_close(found, (without / 23).expand(2, -1))
+    with pytest.raises(ValueError, match=r"known must be bool \[..., 24\], got \[23\]"):
+        hypotheses(known=everyone[1:])
+    with pytest.raises(ValueError, match="known must be bool"):
+        hypotheses(known=chosen)
+
+
 def disturbed(kind: str, values: torch.Tensor, rate: float) -> tuple[torch.Tensor, torch.Tensor]:
     """A recording [T, 5] of which the person did something else, and its true phases [T]."""
     n, generator = len(values), torch.Generator().manual_seed(3)

@@ -49,12 +49,13 @@ class Pace(Part, ABC):
     """Says how much of a step the model goes through, and where members are to be."""
 
     @abstractmethod
-    def start(self, members: Tensor, origin: Tensor | None) -> Any:
+    def start(self, members: Tensor, origin: Tensor | None, known: Tensor | None = None) -> Any:
         """What is remembered of members [..., E, n] that have seen nothing: a NamedTuple of tensors.
 
         Args:
             members: [..., E, n].
-            origin: int64 [..., E], as which of the prior's states they start; None where it does not know.
+            origin: int64 [..., E], as which of the prior's states they start, if only those are known.
+            known: bool [..., N], which of the prior's states are known; default: those, or all.
         """
 
     @abstractmethod

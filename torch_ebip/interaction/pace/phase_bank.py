@@ -146,13 +146,16 @@ class PhaseBank(Pace):
         part.register_buffer("columns", self.columns[view.dofs], persistent=False)
         return part
 
-    def start(self, members: Tensor, origin: Tensor | None) -> Whereabouts:
-        """See `Pace.start`: hypotheses are the demonstrations of the ensemble."""
+    def start(self, members: Tensor, origin: Tensor | None, known: Tensor | None = None) -> Whereabouts:
+        """See `Pace.start`: hypotheses are demonstrations that are known."""
         batch, N = members.shape[:-2], len(self.which)
         own = members.new_ones(*batch, N)
-        if origin is not None:
-            there = members.new_zeros(*batch, self.n_all).scatter(-1, origin.expand(*batch, -1), 1.0)
-            own = there.index_select(-1, self.which)
+        if known is None and origin is not None:
+            known = members.new_zeros(*batch, self.n_all).scatter(-1, origin.expand(*batch, -1), 1.0) > 0
+        if known is not None:
+            if known.shape[-1] != self.n_all:
+                raise ValueError(f"known must be bool [..., {self.n_all}], got {list(known.shape)}")
+            own = known.to(members).expand(*batch, -1).index_select(-1, self.which)
             own = torch.where(own.any(-1, keepdim=True), own, 1.0)  # none of the bank's: then all
         own = own / own.sum(-1, keepdim=True)
         late = self.settings[5]

@@ -15,7 +15,7 @@ class Whereabouts(NamedTuple):
 
     Attributes:
         share: [..., N, 2 P], probability of each phase, going, and then of each, standing still; all sum to 1.
-        anywhere: [..., N, 2 P], that of who leaps: of the demonstrations of the ensemble.
+        anywhere: [..., N, 2 P], that of who leaps: of the demonstrations that are known.
         sums: [..., 3, D], of the samples since the last step their number, times since then and values.
         before: [..., 3, D], of the last period that had any 1, their mean time, before the last step, and value.
         standing: [...], probability that a person stood still at the last step.
