@@ -150,7 +150,7 @@ class NearestMethod:
         chosen = nearest(primitive, y, observed, keep, 1 / primitive.rate)
         time = keep.unsqueeze(-1) / primitive.rate + torch.tensor(ahead)  # [B, K, A]
         mean = paths_after(primitive, time, chosen.unsqueeze(-1).expand(time.shape), dofs).to(y)
-        at = (keep / primitive.rate * primitive.phase_velocity[chosen]).to(y)
+        at = (primitive.first_phase[chosen] + keep / primitive.rate * primitive.phase_velocity[chosen]).to(y)
         return Answer(Forecast(mean, torch.full_like(mean, torch.nan), torch.full_like(mean[..., 0], torch.nan)), at)
 
 

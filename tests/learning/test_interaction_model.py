@@ -313,4 +313,4 @@ def test_a_description_of_something_else_is_refused_though_its_sum_is_right(tmp_
         write_model_file(path, {**description, key: value}, tensors)
         with pytest.raises(ValueError, match="m: a model whose parts do not fit together"):
             load_model(path)
-    assert (KIND, VERSION) == ("torch_ebip model", 7)
+    assert (KIND, VERSION) == ("torch_ebip model", 8)

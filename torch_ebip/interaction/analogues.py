@@ -22,6 +22,7 @@ from torch_ebip.filtering.noise.constraints import Positive, Signed
 from torch_ebip.filtering.protocols import View
 from torch_ebip.filtering.updates.recent import Line
 from torch_ebip.interaction.compared import Compared, compared_of
+from torch_ebip.interaction.course import apart, ends, within
 from torch_ebip.interaction.present import Present
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.interaction.readout import Lead
@@ -182,11 +183,13 @@ class Analogues(nn.Module):
 
     def _weigh(self, present: Present, rows: slice) -> Analogy:
         """Of some rows of a flat batch."""
-        phase, prior = present.phase[rows].clamp(0, 1), present.prior[rows]
+        periodic = self.table.periodic
+        phase, prior = within(present.phase[rows], periodic), present.prior[rows]
         compared = self._compared()
         bank, places = compared.bank, compared.places
         variance = (present.variance[rows] * self.looseness.value.square()).clamp(min=LEAST**2)
-        near = _reached(phase, variance, len(places))
+        # On a circle the last place is the first one.
+        near = slice(len(places) - 1) if periodic else _reached(phase, variance, len(places))
         bank, places = bank[near], places[near]
         P, N, _ = bank.shape
         x, shares = compared.seen(Line(*(part[rows] for part in present.line)), self.dofs)
@@ -194,7 +197,8 @@ class Analogues(nn.Module):
         shares = shares * (self.relevance.value * late.exp().unsqueeze(-1))  # [R, 2, k]
         # c (x - f)^2 without c x^2, which all pairs have in common.
         distance = torch.cat([shares, -2 * shares * x], -2).flatten(1) @ bank.flatten(0, 1).T
-        off = (places - phase.unsqueeze(-1)).square() / variance.unsqueeze(-1)
+        away = apart(places - phase.unsqueeze(-1), periodic)
+        off = away.square() / variance.unsqueeze(-1)
         off = torch.where(off <= REACH**2, off, torch.inf)
         there = prior > -torch.inf
         known = torch.where(there, self.memory.value * torch.where(there, prior, 0), -torch.inf)
@@ -203,7 +207,10 @@ class Analogues(nn.Module):
         each = weights.sum(-2)
         # The quotient of what has next to no say has a gradient without bounds.
         some = each > LEAST_SAY
-        where = (places @ weights) / torch.where(some, each, 1)
+        if periodic:
+            where = phase.unsqueeze(-1) + (away.unsqueeze(-1) * weights).sum(-2) / torch.where(some, each, 1)
+        else:
+            where = (places @ weights) / torch.where(some, each, 1)
         where = torch.where(some, where, phase.unsqueeze(-1))
         even = there.to(each) / there.sum(-1, keepdim=True)
         alone = self.unlike * each.square().sum(-1, keepdim=True)
@@ -223,7 +230,8 @@ class Analogues(nn.Module):
             end = lead.asked.isinf()
             seconds = lead.asked if lead.gone is None else lead.gone.unsqueeze(-2)
             gone = torch.where(end, 0, seconds) * self.pace.unsqueeze(-1)
-            at = torch.where(end, 1, analogy.phase.unsqueeze(-1) + gone).clamp(0, 1)
+            at = analogy.phase.unsqueeze(-1) + gone  # [..., N, P]
+            at = ends(at.transpose(-1, -2), end.unsqueeze(-1), self.table.periodic).transpose(-1, -2)
         which = torch.arange(N, device=at.device).expand(at.shape[:-1])
         whole = len(self.rows) == self.table.n_dofs
         paths = self.table.at(which, at, None if whole else self.rows)  # [..., N, P, D]

@@ -214,7 +214,7 @@ class EvidenceWeighting(Weighting):
 
     def learn(self, memory: Evidence, seen: Seen) -> Evidence:
         """The memory after a sample that was ``seen``: compared with the demonstrations near the members' phases."""
-        phases = (seen.moving.narrow(-1, 0, 1) + self.offsets).clamp(0, 1)
+        phases = seen.moving.narrow(-1, 0, 1) + self.offsets
         assert seen.origin is not None
         paths = self.table.at(seen.origin, phases, seen.rows)
         return self.compare(memory, paths, seen)

@@ -243,7 +243,7 @@ class Expert(nn.Module):
         said = self.read(self.inputs(before)).index_select(-1, self.place)  # [..., K, D]
         phase, K = present.phase.unsqueeze(-1), len(self.seconds)
         asked = lead.phase if lead.asked is None else torch.where(lead.end > 0, 1, phase + self.pace * lead.seconds)
-        mean = self._mean(torch.cat([self._after(phase, self.seconds), asked.clamp(0, 1)], -1))
+        mean = self._mean(torch.cat([self._after(phase, self.seconds), asked], -1))
         off = torch.where(self.spoken, said - mean[..., :K, :], 0)
         return mean[..., K:, :] + horizon_hats(lead, self.seconds) @ off
 
@@ -261,7 +261,7 @@ class Expert(nn.Module):
     def _after(self, phase: Tensor, seconds: Tensor) -> Tensor:
         """Phases [..., P] so many seconds [P] after a phase [..., 1], at the mean pace; 1 where the end is asked."""
         end = seconds.isinf()
-        return torch.where(end, 1, phase + self.pace * torch.where(end, 0, seconds)).clamp(0, 1)
+        return torch.where(end, 1, phase + self.pace * torch.where(end, 0, seconds))
 
     def _mean(self, phase: Tensor) -> Tensor:
         """The mean path [..., P, D] at phases [..., P]."""

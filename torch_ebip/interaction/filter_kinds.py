@@ -13,6 +13,7 @@ from torch_ebip.filtering.functional.moments import centred, member_shares
 from torch_ebip.filtering.members import MemberFilter
 from torch_ebip.filtering.particle import ParticleFilter
 from torch_ebip.filtering.states import State
+from torch_ebip.interaction.course import ends
 from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.forecast import Forecast, as_phases
 
@@ -51,7 +52,9 @@ class InteractionMemberFilter(InteractionFilter, MemberFilter):
             seconds = waits.gone_apart(ahead, members.shape[-2])
         # A member that runs backwards, of a hand that goes back, waits: it has no end to come to.
         phase = now + velocity.clamp(min=0) * torch.where(end, 0, seconds)
-        phase = torch.where(end, 1, phase).clamp(max=1)
+        periodic = self.phase_model.periodic
+        phase = ends(phase, end, periodic)
+        phase = phase if periodic else phase.clamp(max=1)
         weights = None if state.weights is None else state.weights.unsqueeze(-2)
         mean = functional.ensemble_mean(phase.unsqueeze(-1), weights)
         centre = self._centre(state)
@@ -93,8 +96,10 @@ class InteractionExtendedFilter(InteractionFilter, ExtendedFilter):
     def _forecast_ahead(self, state: GaussianState, ahead: Tensor) -> Forecast:
         """See `InteractionFilter._forecast_ahead`: at the mean velocity."""
         now, velocity = self.phase(state).unsqueeze(-1), self.phase_velocity(state).unsqueeze(-1)
-        phase = torch.where(ahead.isinf(), 1, now + velocity.clamp(min=0) * torch.where(ahead.isinf(), 0, ahead))
-        phase = phase.clamp(max=1)
+        phase = now + velocity.clamp(min=0) * torch.where(ahead.isinf(), 0, ahead)
+        if self.phase_model.periodic:
+            return self._forecast(state, phase)
+        phase = torch.where(ahead.isinf(), 1, phase).clamp(max=1)
         return self._forecast(state, phase)
 
     def _forecast(self, state: GaussianState, phase: Tensor) -> Forecast:

@@ -59,6 +59,8 @@ class InteractionFilter(Filter):
                 f"an {type(self).__name__} is over a phase model and a basis projection, see `interaction_model`, "
                 f"got {type(model.dynamics).__name__} and {type(model.measurement).__name__}"
             )
+        if model.dynamics.periodic != model.measurement.basis.periodic:
+            raise ValueError("a phase on a circle and a periodic basis go together, such as `CyclicPhase`: got one")
         if not isinstance(getattr(self.prior, "states", None), Tensor):
             raise ValueError(
                 f"a {type(self.prior).__name__} knows no demonstrations that forecasts could rest on: "
@@ -112,7 +114,7 @@ class InteractionFilter(Filter):
 
         Args:
             state: of this filter.
-            phase: [P] or [..., P], or one number; default: 50 phases evenly from the current one to 1.
+            phase: [P] or [..., P], or one number; default: 50 phases evenly from the current one to 1, or once round.
             ahead: instead of phases: seconds, [P] or one number, each member at its own velocity, backwards none;
                 infinity is the end, behind which nothing lies. `Forecast.phase` is then the mean of the members'. A
                 read-out with a share for the end takes it for infinity, and towards phase 1 where phases are asked.
@@ -151,7 +153,8 @@ class InteractionFilter(Filter):
     def lead(self, state: State, phase: Tensor, asked: Tensor | None = None) -> Lead:
         """How far ahead of a ``state`` each ``phase`` [..., P] lies, of seconds [P] if those were ``asked`` for."""
         moving = self.moving(state)
-        return lead_of(moving[..., 0], self.phase_model.velocity(moving), phase, asked)
+        model = self.phase_model
+        return lead_of(moving[..., 0], model.velocity(moving), phase, asked, model.periodic)
 
     def demonstrated(self, phase: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of the demonstrations at phases [..., P]: [..., P, D], units of the DoFs and squared."""
@@ -292,5 +295,6 @@ class InteractionFilter(Filter):
         """Phases that are asked for; by default 50, [..., 50], evenly from the current one to 1."""
         if phase is not None:
             return as_phases(phase, state[0])
-        now = self.phase(state).clamp(0, 1).unsqueeze(-1)
-        return now + (1 - now) * torch.linspace(0, 1, 50, dtype=now.dtype, device=now.device)
+        now, periodic = self.phase(state).unsqueeze(-1), self.phase_model.periodic
+        part = torch.linspace(0, 1, 50, dtype=now.dtype, device=now.device)
+        return now + part if periodic else now.clamp(0, 1) + (1 - now.clamp(0, 1)) * part

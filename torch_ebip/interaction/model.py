@@ -15,6 +15,7 @@ from torch_ebip.interaction.basis.base import Basis
 from torch_ebip.interaction.gated_noise import PhaseGatedNoise
 from torch_ebip.interaction.noise import InteractionNoise, WeightNoise
 from torch_ebip.interaction.phases.constant_velocity import ConstantVelocityPhase
+from torch_ebip.interaction.phases.cyclic import CyclicPhase
 from torch_ebip.interaction.phases.phase import PhaseModel
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.interaction.projection import BasisProjection
@@ -36,13 +37,13 @@ def interaction_model(
             ``primitive.correlated_residual_variance``.
         weight_noise: rate of the weights' random walk at the start, 1/sqrt(s), see `WeightNoise`; default: none.
         context: functions of phase for an R that depends on it; see `PhaseGatedNoise`.
-        phase: how the phase moves; default: the paper's `ConstantVelocityPhase`.
+        phase: how the phase moves; default: see `usual_phase`.
 
     Raises:
         ValueError: a variance that is not [D] or not positive; a rate that is not.
     """
     layout, weights = primitive.layout, primitive.weights
-    phase = ConstantVelocityPhase() if phase is None else copy.deepcopy(phase).to(weights)
+    phase = usual_phase(primitive) if phase is None else copy.deepcopy(phase).to(weights)
     basis = copy.deepcopy(primitive.basis).to(weights)
     modality_of_dof = layout.modality_of_dof.to(weights.device)
     walk = None
@@ -69,12 +70,17 @@ def interaction_model(
     )
 
 
+def usual_phase(primitive: InteractionPrimitive) -> PhaseModel:
+    """The paper's phase, or that on a circle for a primitive of demonstrations that repeat."""
+    return CyclicPhase() if primitive.periodic else ConstantVelocityPhase()
+
+
 def demonstration_states(primitive: InteractionPrimitive, phase: PhaseModel | None = None) -> Tensor:
-    """[N, n]: what moves, with phase 0, and the weights of each demonstration.
+    """[N, n]: what moves, with the first phase, and the weights of each demonstration.
 
     Args:
         primitive: of the demonstrations.
-        phase: how the phase moves; default: the paper's `ConstantVelocityPhase`.
+        phase: how the phase moves; default: see `usual_phase`.
     """
-    phase = ConstantVelocityPhase() if phase is None else phase
+    phase = usual_phase(primitive) if phase is None else phase
     return torch.cat([phase.first(primitive), primitive.weights], dim=-1)

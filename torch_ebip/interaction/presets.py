@@ -76,7 +76,7 @@ def ebip(
         primacy: how much more they hold of what came first, at the start.
         slope: how much more that evidence counts late than early, at the start.
         relative: how far its distances are relative to the spread of the demonstrations there, at the start.
-        phase: how the phase moves; default: the paper's `ConstantVelocityPhase`.
+        phase: how the phase moves; default: the paper's `ConstantVelocityPhase`, or `CyclicPhase` where it repeats.
         pace: of the primitive, for people who pause, start late or start over: see `PhaseBank`.
 
     Returns:

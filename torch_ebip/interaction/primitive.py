@@ -33,14 +33,16 @@ class InteractionPrimitive(Meaning):
         basis: one basis a DoF.
         rate: samples a second of the demonstrations, Hz.
         weights: [N, n_weights], least-squares weights of each demonstration.
-        phase_velocity: [N], 1 / duration, 1/s.
+        phase_velocity: [N], 1 / duration, 1/s; of those that repeat, cycles a second.
         residual_variance: [D], the paper's closed-form R (Section IV): the mean over demonstrations of each
             one's mean squared residual, in squared units of the DoF.
         residual_correlation_time: [D], integrated autocorrelation time of those residuals, in samples.
         value_variance: [D], variance of each DoF over all measured samples, squared units; 0 for a constant.
         longest_repeat: [M] seconds for which each modality says the same to the last digit; see `longest_repeats`.
-        end_variance: [D], variance over demonstrations of h(1, w), squared units.
+        end_variance: [D], variance over demonstrations of h(1, w), of the last value, squared units.
         labels: which interaction each demonstration shows, N names; None where nothing says.
+        first_phase: [N], where each demonstration begins: 0; of those that repeat, where on the circle.
+        cycles: [N], how often each goes through all phases: 1, unless they repeat.
 
     Raises:
         ValueError: labels that are not one for each demonstration.
@@ -52,6 +54,8 @@ class InteractionPrimitive(Meaning):
     residual_correlation_time: Tensor
     value_variance: Tensor
     longest_repeat: Tensor
+    first_phase: Tensor
+    cycles: Tensor
 
     def __init__(
         self,
@@ -65,6 +69,8 @@ class InteractionPrimitive(Meaning):
         value_variance: Tensor,
         longest_repeat: Tensor | None = None,
         labels: Sequence[str] | None = None,
+        first_phase: Tensor | None = None,
+        cycles: Tensor | None = None,
     ) -> None:
         super().__init__()
         if labels is not None and len(labels) != len(weights):
@@ -80,28 +86,37 @@ class InteractionPrimitive(Meaning):
         self.register_buffer("value_variance", owned(value_variance))
         repeat = weights.new_zeros(len(layout.names)) if longest_repeat is None else longest_repeat
         self.register_buffer("longest_repeat", owned(repeat))
+        first_phase = torch.zeros_like(phase_velocity) if first_phase is None else first_phase
+        self.register_buffer("first_phase", owned(first_phase))
+        self.register_buffer("cycles", owned(torch.ones_like(phase_velocity) if cycles is None else cycles))
 
     @classmethod
     @in_own_modes
-    def fit(cls, demonstrations: Demonstrations, basis: StackedBasis | None = None) -> InteractionPrimitive:
+    def fit(
+        cls, demonstrations: Demonstrations, basis: StackedBasis | None = None, *, periodic: bool = False
+    ) -> InteractionPrimitive:
         """Batched least squares (float64) of all demonstrations and DoFs, tolerant of missing samples.
 
         Args:
             demonstrations: at least two.
-            basis: default: `select_basis(demonstrations)`.
+            basis: default: `select_basis(demonstrations)`; a periodic one for interactions that repeat, whose cycles
+                are then looked for.
+            periodic: whether they repeat; default: as the basis says.
 
         Returns:
             A primitive in the dtype and on the device of the demonstrations.
 
         Raises:
             ValueError: one demonstration only; a basis for another number of DoFs; a demonstration shorter
-                than its basis has functions; a DoF that was never measured.
+                than its basis has functions; a DoF that was never measured; periodic ones that do not repeat.
         """
         if len(demonstrations) < 2:
             raise ValueError("a primitive needs at least 2 demonstrations to have a spread, got 1")
-        basis = select_basis(demonstrations) if basis is None else basis
+        basis = select_basis(demonstrations, periodic=periodic) if basis is None else basis
         if not isinstance(basis, StackedBasis):
             raise ValueError(f"basis must be a StackedBasis, one basis for each DoF, got {type(basis).__name__}")
+        if periodic and not basis.periodic:
+            raise ValueError("interactions that repeat need a periodic basis, such as PeriodicBSplineBasis")
         layout = demonstrations.layout
         if basis.n_dofs != layout.n_dofs:
             raise ValueError(f"the basis is for {basis.n_dofs} DoFs, the demonstrations have {layout.n_dofs}")
@@ -112,7 +127,7 @@ class InteractionPrimitive(Meaning):
                     f"demonstration {index} has {len(trajectory)} samples, fewer than the {largest} functions "
                     "of the basis"
                 )
-        samples = samples_of(demonstrations)
+        samples = samples_of(demonstrations, basis.periodic)
         resolution = torch.finfo(demonstrations[0].dtype).eps
         weights = samples.values.new_empty(len(demonstrations), basis.n_weights)
         variance = samples.values.new_empty(layout.n_dofs)
@@ -132,13 +147,21 @@ class InteractionPrimitive(Meaning):
         variance = torch.maximum(variance, torch.where(spread > 0, 1e-10 * spread, 1e-12 * size))
         variance = torch.where(variance > 0, variance, 1e-12)
         dtype = demonstrations[0].dtype
-        velocity = 1 / demonstrations.durations.to(weights)
+        first, cycles = samples.phase[:, 0], samples.phase[:, -1] - samples.phase[:, 0]
+        velocity = cycles / demonstrations.durations.to(weights)
         repeats = longest_repeats(demonstrations).to(weights.device)
-        tensors: Sequence[Tensor] = (weights, velocity, variance, correlation, spread, repeats)
-        made = [tensor.to(dtype) for tensor in tensors]
-        primitive = cls(layout, basis, demonstrations.rate, *made)  # type: ignore[arg-type]
-        primitive.labels = demonstrations.labels
-        return primitive
+        tensors = {
+            "weights": weights,
+            "phase_velocity": velocity,
+            "residual_variance": variance,
+            "residual_correlation_time": correlation,
+            "value_variance": spread,
+            "longest_repeat": repeats,
+            "first_phase": first,
+            "cycles": cycles,
+        }
+        made = {name: tensor.to(dtype) for name, tensor in tensors.items()}
+        return cls(layout, basis, demonstrations.rate, **made, labels=demonstrations.labels)
 
     def extra_repr(self) -> str:
         """Sizes, and what the columns are."""
@@ -154,6 +177,28 @@ class InteractionPrimitive(Meaning):
         return len(self.weights)
 
     @property
+    def periodic(self) -> bool:
+        """Whether the demonstrations repeat: phases are then those of a circle."""
+        return self.basis.periodic
+
+    @property
+    def durations(self) -> Tensor:
+        """[N], s."""
+        return self.cycles / self.phase_velocity
+
+    def phase_after(self, time: Tensor, which: Tensor | None = None) -> Tensor:
+        """[...], where demonstrations are so long after they began; from their end on, where they end.
+
+        Args:
+            time: [...], s; infinity: the end.
+            which: int64 [...], which demonstrations; default: all, in the last dimension.
+        """
+        first, velocity, duration = (
+            each if which is None else each[which] for each in (self.first_phase, self.phase_velocity, self.durations)
+        )
+        return first + velocity * torch.minimum(time, duration)
+
+    @property
     def correlated_residual_variance(self) -> Tensor:
         """[D]: a corrected closed form, `residual_variance` times `residual_correlation_time`.
 
@@ -165,9 +210,11 @@ class InteractionPrimitive(Meaning):
 
     @property
     def end_variance(self) -> Tensor:
-        """[D]: variance over demonstrations of the value at phase 1."""
-        one = torch.ones(len(self), dtype=self.weights.dtype, device=self.weights.device)
-        return self.basis.project(one, self.weights - self.weights.mean(0)).var(0)
+        """[D]: variance over demonstrations of the value at the end."""
+        end = self.first_phase + self.cycles
+        if self.periodic:  # at different phases, so that the mean differs, too
+            return self.basis.project(end, self.weights).var(0)
+        return self.basis.project(end, self.weights - self.weights.mean(0)).var(0)
 
     def extend(self, demonstrations: Demonstrations) -> InteractionPrimitive:
         """The same basis and noise with more demonstrations: at least one, which need no more than a regression.
@@ -194,6 +241,8 @@ class InteractionPrimitive(Meaning):
             self.value_variance,
             torch.maximum(self.longest_repeat, more.longest_repeat),
             None if self.labels is None or demonstrations.labels is None else (*self.labels, *demonstrations.labels),
+            torch.cat([self.first_phase, more.first_phase[: len(demonstrations)]]),
+            torch.cat([self.cycles, more.cycles[: len(demonstrations)]]),
         )
 
     def subset(self, indices: Sequence[int] | Sequence[bool] | Tensor) -> InteractionPrimitive:
@@ -217,4 +266,6 @@ class InteractionPrimitive(Meaning):
             self.value_variance,
             self.longest_repeat,
             None if self.labels is None else [self.labels[i] for i in indices.tolist()],
+            self.first_phase[indices],
+            self.cycles[indices],
         )

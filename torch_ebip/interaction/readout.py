@@ -72,7 +72,7 @@ class Readout(Protocol):
         """The same for a view of the model."""
 
 
-def lead_of(phase: Tensor, velocity: Tensor, of: Tensor, asked: Tensor | None = None) -> Lead:
+def lead_of(phase: Tensor, velocity: Tensor, of: Tensor, asked: Tensor | None = None, periodic: bool = False) -> Lead:
     """How far phases ``of`` [..., P] lie ahead of a phase [...] at a velocity [...], 1/s; at rest: for ever.
 
     Args:
@@ -81,10 +81,16 @@ def lead_of(phase: Tensor, velocity: Tensor, of: Tensor, asked: Tensor | None = 
         of: [..., P], what is forecast.
         asked: [P], the seconds ahead that were asked for; infinity is the end. Default: phases were, and the end is
             the last of them, which others approach from `NEAR` on.
+        periodic: whether phases are those of a circle, which have no end unless it is asked for.
     """
-    of, velocity = of.clamp(0, 1), velocity.unsqueeze(-1)
-    end = (of - NEAR) / (1 - NEAR) if asked is None else asked.isinf().to(of).expand_as(of)
-    ahead = (of - phase.clamp(0, 1).unsqueeze(-1)).clamp(min=0)
+    velocity = velocity.unsqueeze(-1)
+    if periodic:
+        end = torch.zeros_like(of) if asked is None else asked.isinf().to(of).expand_as(of)
+        ahead = (of - phase.unsqueeze(-1)).clamp(min=0)
+    else:
+        of = of.clamp(0, 1)
+        end = (of - NEAR) / (1 - NEAR) if asked is None else asked.isinf().to(of).expand_as(of)
+        ahead = (of - phase.clamp(0, 1).unsqueeze(-1)).clamp(min=0)
     going = velocity > 0
     seconds = torch.where(going, ahead / torch.where(going, velocity, 1), torch.inf)
     return Lead(ahead, torch.where(ahead > 0, seconds, 0), of, end.clamp(0, 1), asked)

@@ -97,7 +97,7 @@ class InteractionSurprise(SensorLevels):
         least = 1e-6 * primitive.value_variance + torch.finfo(weights.dtype).eps ** 1.5
         noise = torch.maximum(primitive.residual_variance, least)
         sensors = primitive.layout.modality_of_dof.to(weights.device)
-        settings = {"memory": 0.5 * float(1 / primitive.phase_velocity.median()), **settings}
+        settings = {"memory": 0.5 * float(primitive.durations.median()), **settings}
         pace = primitive.phase_velocity.mean()
         deviation = primitive.phase_velocity.var(correction=0).sqrt().clamp(min=LEAST_SPREAD * pace)
         return cls(mean, variance.clamp(min=0), noise, sensors, torch.stack([pace, deviation]), **settings)

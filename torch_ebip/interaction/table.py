@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from torch_ebip.common.ambient import outside_inference, owned
 from torch_ebip.filtering.protocols import View
+from torch_ebip.interaction.course import within
 from torch_ebip.interaction.primitive import InteractionPrimitive
 
 POINTS = 41
@@ -27,6 +28,7 @@ class DemonstrationTable(nn.Module):
     Args:
         values: [N, P, D], units of the DoFs.
         slopes: [N, P, D], by phase.
+        periodic: whether phases are those of a circle.
 
     Raises:
         ValueError: fewer than two phases, or shapes that differ.
@@ -42,8 +44,9 @@ class DemonstrationTable(nn.Module):
 
     cells: Tensor
 
-    def __init__(self, values: Tensor, slopes: Tensor) -> None:
+    def __init__(self, values: Tensor, slopes: Tensor, periodic: bool = False) -> None:
         super().__init__()
+        self.periodic = periodic
         if values.ndim != 3 or values.shape[1] < 2 or slopes.shape != values.shape:
             raise ValueError(
                 f"values and slopes must be [N, P, D] with at least 2 phases, got {list(values.shape)} and "
@@ -70,7 +73,8 @@ class DemonstrationTable(nn.Module):
         phase = torch.linspace(0, 1, points, dtype=weights.dtype, device=weights.device)
         many = weights.unsqueeze(1).expand(-1, points, -1)
         with torch.no_grad():
-            return cls(basis.project_paths(phase, weights), basis.project_derivative(phase, many))
+            paths = basis.project_paths(phase, weights)
+            return cls(paths, basis.project_derivative(phase, many), basis.periodic)
 
     @property
     def n_dofs(self) -> int:
@@ -94,7 +98,7 @@ class DemonstrationTable(nn.Module):
 
         Args:
             demonstrations: int64 [...], which.
-            phase: [..., O], within [0, 1].
+            phase: [..., O]; outside [0, 1] as at the nearer end, or on the circle.
             dofs: int64 [k], which DoFs; default: all.
 
         Returns:
@@ -102,7 +106,7 @@ class DemonstrationTable(nn.Module):
         """
         N, P = self.cells.shape[:2]
         cells = self.cells if dofs is None else self._part(dofs)
-        place = phase * P
+        place = within(phase, self.periodic) * P
         cell = place.detach().floor().clamp(max=P - 1)
         t = (place - cell).unsqueeze(-1)
         rows = torch.add(cell.long(), demonstrations.unsqueeze(-1), alpha=P)
@@ -143,6 +147,7 @@ class DemonstrationTable(nn.Module):
         nn.Module.__init__(part)
         part._parts = OrderedDict()
         part._spread = None
+        part.periodic = self.periodic
         part.register_buffer("cells", self.cells[..., view.dofs])
         return part
 

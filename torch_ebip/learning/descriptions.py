@@ -22,6 +22,7 @@ from torch_ebip.filtering.updates.trust import RobustWeights
 from torch_ebip.interaction.basis.base import Basis
 from torch_ebip.interaction.basis.bspline import BSplineBasis
 from torch_ebip.interaction.basis.gaussian import GaussianBasis
+from torch_ebip.interaction.basis.periodic import FourierBasis, PeriodicBSplineBasis
 from torch_ebip.interaction.basis.polynomial import PolynomialBasis
 from torch_ebip.interaction.basis.sigmoid import SigmoidBasis
 from torch_ebip.interaction.basis.stacked import StackedBasis
@@ -32,6 +33,7 @@ from torch_ebip.interaction.gated_noise import PhaseGatedNoise
 from torch_ebip.interaction.noise import InteractionNoise
 from torch_ebip.interaction.phases.accelerating import AcceleratingPhase
 from torch_ebip.interaction.phases.constant_velocity import ConstantVelocityPhase
+from torch_ebip.interaction.phases.cyclic import CyclicPhase
 from torch_ebip.interaction.phases.drifting import DriftingPhase
 from torch_ebip.interaction.phases.phase import PhaseModel
 from torch_ebip.interaction.present import recent_of
@@ -44,7 +46,8 @@ from torch_ebip.learning.readout_descriptions import describe_readout, readout_o
 from torch_ebip.recordings.layout import Layout, Modality
 
 BASES: dict[str, type[Basis]] = {
-    family.__name__: family for family in (BSplineBasis, GaussianBasis, PolynomialBasis, SigmoidBasis)
+    family.__name__: family
+    for family in (BSplineBasis, FourierBasis, GaussianBasis, PeriodicBSplineBasis, PolynomialBasis, SigmoidBasis)
 }
 TRUST: dict[str, Callable[[], RobustWeights]] = {"Cauchy": Cauchy, "Gate": Gate, "Huber": Huber, "StudentT": StudentT}
 OPTIONS = (
@@ -241,7 +244,7 @@ def fill(filter: nn.Module, tensors: Mapping[str, Tensor]) -> None:
 
 def _describe_phase(phase: PhaseModel) -> Description:
     family = type(phase)
-    if family not in (AcceleratingPhase, ConstantVelocityPhase, DriftingPhase):
+    if family not in (AcceleratingPhase, ConstantVelocityPhase, CyclicPhase, DriftingPhase):
         raise TypeError(f"a model file keeps the phases of the library, not {family.__name__}")
     return {"family": family.__name__, "overrun": phase.overrun}
 
@@ -249,6 +252,8 @@ def _describe_phase(phase: PhaseModel) -> Description:
 def _phase_of(description: Description) -> PhaseModel:
     if description["family"] == "ConstantVelocityPhase":
         return ConstantVelocityPhase(description["overrun"])
+    if description["family"] == "CyclicPhase":
+        return CyclicPhase(description["overrun"])
     if description["family"] == "AcceleratingPhase":
         return AcceleratingPhase(description["overrun"])
     if description["family"] == "DriftingPhase":

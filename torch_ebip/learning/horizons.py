@@ -31,25 +31,23 @@ def spread_ahead(primitive: InteractionPrimitive, ahead: Tensor) -> Tensor:
 
     At the times that lie so many seconds ``ahead`` [P] of a present moment; what the training mean errs there.
     """
-    weights, velocity = primitive.weights, primitive.phase_velocity
-    longest = float((1 / velocity).max())
-    time = torch.linspace(0, longest, 201, dtype=weights.dtype, device=weights.device)
-    phase = time * velocity.unsqueeze(-1)  # [N, 201]
-    paths = primitive.basis.project(phase.clamp(max=1), weights.unsqueeze(1))
+    weights, durations = primitive.weights, primitive.durations
+    time = torch.linspace(0, float(durations.max()), 201, dtype=weights.dtype, device=weights.device)
+    share = time / durations.unsqueeze(-1)  # [N, 201]
+    paths = primitive.basis.project(primitive.phase_after(time.unsqueeze(-1)).T, weights.unsqueeze(1))
     N = len(weights)
     squares = (paths - paths.mean(0)).square() * (N / (N - 1))
-    now = phase - torch.where(ahead.isinf(), 0, ahead).view(-1, 1, 1) * velocity.unsqueeze(-1)
+    now = share - torch.where(ahead.isinf(), 0, ahead).view(-1, 1, 1) / durations.unsqueeze(-1)
     first, last = HORIZONS
-    asked = ((now >= first) & (now <= last) & (phase <= 1)).to(weights)  # [P, N, 201]
+    asked = ((now >= first) & (now <= last) & (share <= 1)).to(weights)  # [P, N, 201]
     found = torch.einsum("pnt,ntd->pd", asked, squares) / asked.sum((1, 2)).clamp(min=1).unsqueeze(-1)
     return torch.where(ahead.isinf().unsqueeze(-1), primitive.end_variance, found)
 
 
 def goes_on(primitive: InteractionPrimitive, ahead: Tensor) -> Tensor:
     """[P]: share of the present moments of demonstrations after which they go on for so many seconds [P]."""
-    velocity = primitive.phase_velocity.unsqueeze(-1)
     first, last = HORIZONS
-    there = ((1 - ahead * velocity - first) / (last - first)).clamp(0, 1).mean(0)
+    there = ((1 - ahead / primitive.durations.unsqueeze(-1) - first) / (last - first)).clamp(0, 1).mean(0)
     return torch.where(ahead.isinf(), 1, there)
 
 

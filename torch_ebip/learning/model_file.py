@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from types import ModuleType
 
 KIND = "torch_ebip model"
-VERSION = 7
+VERSION = 8
 """Of what is written; every version up to it is read."""
 LIMIT = 1 << 33
 """Bytes of a file."""

@@ -212,7 +212,10 @@ class ForecastObjective(Meaning):
         if trace.kept is None:
             raise ValueError("the trace kept no states to forecast from")
         end = torch.ones(1, dtype=truth.dtype, device=truth.device)
-        forecast = filter.forecast(trace.kept, end).select(targets)
+        if filter.phase_model.periodic:  # nobody knows the phase of an end
+            forecast = filter.forecast(trace.kept, ahead=end / 0).select(targets)
+        else:
+            forecast = filter.forecast(trace.kept, end).select(targets)
         scale = self.scale if self.ahead is None else self.scale[-1]
         error = (forecast.mean[..., 0, :] - truth[..., -1, :]) / scale
         error = torch.where(error.isnan(), 0, error)

@@ -11,14 +11,13 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from torch_ebip.common.ambient import without_autocast
-from torch_ebip.filtering.functional.scores import gaussian_crps
 from torch_ebip.interaction.filter_kinds import InteractionEnsembleFilter
 from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.pace.phase_bank import PhaseBank
 from torch_ebip.interaction.primitive import InteractionPrimitive
+from torch_ebip.learning.crps import crps_of
 from torch_ebip.learning.held_out import HeldOut
 from torch_ebip.learning.interruptions import again, idle, interrupted, late, pause
 from torch_ebip.learning.partition import generator_of
@@ -30,10 +29,6 @@ TRIED = ((1.0, 1.0), (1.0, 2.0), (2.0, 3.0))
 """What distances count, as multiples of what they do at first, and by how many deviations phases may differ."""
 COSTS = 0.01
 """Share by which forecasts of undisturbed interactions may get worse."""
-MOST, FEWEST = 32, 6
-"""Interactions that decide, at most in all and at least of each set of sensors."""
-SHARES = (0.3, 0.5, 0.7, 0.9)
-"""Of recordings, up to which they are shown."""
 
 
 @without_autocast
@@ -72,16 +67,17 @@ def learn_pace(
     }
     order = torch.randperm(len(demonstrations), generator=draws, device="cpu")
 
-    without = {name: _crps(each, filter, order) for name, each in both.items()}
+    filter.analysis.pace = None  # of those that repeat, which were tuned with one
+    without = {name: crps_of(each, filter, order) for name, each in both.items()}
     tried: dict[tuple[float, float], dict[str, float]] = {}
     fair = []
     try:
         for settings, bank in banks.items():
             filter.analysis.pace = bank
-            tried[settings] = {"undisturbed": _crps(both["undisturbed"], filter, order)}
+            tried[settings] = {"undisturbed": crps_of(both["undisturbed"], filter, order)}
             if tried[settings]["undisturbed"] <= (1 + COSTS) * without["undisturbed"]:
                 fair.append(settings)
-                tried[settings]["interrupted"] = _crps(both["interrupted"], filter, order)
+                tried[settings]["interrupted"] = crps_of(both["interrupted"], filter, order)
     except KeyboardInterrupt:
         filter.analysis.pace = None  # of those tried none has been chosen
         raise
@@ -99,26 +95,6 @@ def _bank(primitive: InteractionPrimitive, sharpness: float, agree: float) -> Ph
     bank = PhaseBank.of(primitive, agree=agree)
     bank.settings[3:5] *= sharpness  # of values and velocities
     return bank
-
-
-def _crps(held_out: HeldOut, filter: InteractionFilter, order: Tensor) -> float:
-    """CRPS of forecasts over all horizons and DoFs, units of the targets' spread, of some interactions int64 [N]."""
-    task = held_out.task
-    each = max(FEWEST, MOST // len(task.subsets))
-    shares = torch.tensor(SHARES, device="cpu")
-    total = count = 0.0
-    for i, subset in enumerate(task.subsets.values()):
-        some = order.roll(-i * each)[:each]
-        for trial in held_out.trials(filter, some, subset, shares):
-            forecast, truth = trial.forecast(task.objective), trial.shown.truth
-            measured = ~truth.isnan()
-            scale = task.objective.scale.expand_as(truth)
-            found = gaussian_crps(forecast.mean, forecast.variance, torch.where(measured, truth, 0)) / scale
-            total += float(found[measured].double().sum())
-            count += float(measured.sum())
-    parts = held_out.ranks.gather([torch.tensor([total, count], dtype=torch.float64, device="cpu")])
-    sums = torch.stack([part for share in parts for part in share]).sum(0)
-    return float(sums[0] / sums[1])
 
 
 def describe_pace(filter: InteractionFilter) -> dict[str, Any] | None:

@@ -13,24 +13,20 @@ from torch import Tensor
 
 from torch_ebip.common.files import write_json
 from torch_ebip.interaction.analogues import Analogues
-from torch_ebip.interaction.basis.selection import rank_candidates, select_basis, selection_table
+from torch_ebip.interaction.basis.selection import selection_table
 from torch_ebip.interaction.basis.stacked import StackedBasis
 from torch_ebip.interaction.filter_kinds import InteractionEnsembleFilter
-from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.kinematics import RobotArm
 from torch_ebip.learning.caution import familiar, learn_caution
-from torch_ebip.learning.configuration import Task
 from torch_ebip.learning.drawing import Drawn
-from torch_ebip.learning.groups import labelled
-from torch_ebip.learning.held_out import HeldOut
-from torch_ebip.learning.horizons import horizon_name, reached
+from torch_ebip.learning.horizons import horizon_name
 from torch_ebip.learning.interaction_model import NAME, InteractionModel
 from torch_ebip.learning.losses import ForwardKinematicsLoss
 from torch_ebip.learning.monitor import Monitor
-from torch_ebip.learning.objective import objective_for
 from torch_ebip.learning.pacing import learn_pace
 from torch_ebip.learning.partition import generator_of
 from torch_ebip.learning.place import enter, fingerprint
+from torch_ebip.learning.preparing import Asked, prepared
 from torch_ebip.learning.progress import Reporter
 from torch_ebip.learning.ranks import Ranks
 from torch_ebip.learning.reading_out import learn_readout
@@ -43,7 +39,7 @@ from torch_ebip.learning.starts import FACTORS, TRIES, Start, best_factor, best_
 from torch_ebip.learning.tuner import Tuner
 from torch_ebip.recordings.demonstrations import Demonstrations
 
-PROCEDURE = 6  # what another edition of this file began in a folder is not gone on with
+PROCEDURE = 7  # what another edition of this file began in a folder is not gone on with
 FEWEST = 10
 """Demonstrations below which there is no gradient: those kept for validation would say nothing."""
 DECIDING, MOST = 200, 100
@@ -67,6 +63,7 @@ class Procedure:
     analogues: bool
     expert: bool
     pace: bool
+    periodic: bool | None
     ahead: tuple[float, ...]
     memories: int
     chances: dict[str, float]
@@ -85,31 +82,16 @@ class Procedure:
     def prepare(
         self, arm: RobotArm | ForwardKinematicsLoss | None, joints: str | None, basis: StackedBasis | None
     ) -> None:
-        """Basis, primitive, objective."""
+        """Basis, phase, primitive, objective."""
         self.began = time.monotonic()
-        layout = self.known.layout
-        targets = layout.mask(self.targets)
-        self.ranking = None if basis is not None else rank_candidates(self.known)
-        basis = select_basis(self.known, ranking=self.ranking) if basis is None else basis
-        self.primitive = primitive = InteractionPrimitive.fit(self.known, basis).to(self.ranks.device)
-        targets = targets.to(primitive.weights.device)
         given = self.known.labels
-        self.known, self.remarks = labelled(self.known, primitive, self.settings.seed, self.ranks)
-        labels = primitive.labels = self.known.labels
+        asked = Asked(self.targets, self.subsets, self.ahead, arm, joints)
+        made = prepared(self.known, asked, basis, self.periodic, self.settings, self.ranks)
+        self.known, self.primitive, self.task, self.held_out = made.known, made.primitive, made.task, made.held_out
+        self.ranking, self.remarks, self.course = made.ranking, list(made.remarks), made.course
+        labels = self.known.labels
         self.groups = {} if labels is None or labels == given else {label: labels.count(label) for label in labels}
-        objective = objective_for(primitive, targets, self.targets, self._horizons(), arm, joints)
-        masks = {name: layout.mask(names).to(targets.device) for name, names in self.subsets.items()}
-        self.task = Task(primitive, objective, targets, masks)
-        self.held_out = HeldOut(self.known, self.task, self.settings, self.ranks)
         self.deciding = self.held_out.partition.order[: max(DECIDING, len(self.scored))]
-
-    def _horizons(self) -> list[float]:
-        """The horizons that enough demonstrations reach; of the others the report says so."""
-        there = reached(self.primitive, self.ahead)
-        short = ", ".join(horizon_name(a) for a in self.ahead if a not in there)
-        if short:
-            self.remarks.append(f"not scored, because hardly any demonstration goes on for so long: {short}")
-        return there
 
     def enter(self, place: Path) -> InteractionModel | None:
         """See `place.enter`."""
@@ -135,6 +117,7 @@ class Procedure:
             "analogues": self.analogues,
             "expert": self.expert,
             "pace": self.pace,
+            "periodic": self.primitive.periodic,
             "ahead": [horizon_name(a) for a in self.ahead],
             "memories": self.memories,
             "chances": self.chances,
@@ -286,6 +269,7 @@ class Procedure:
                 "remarks": self.remarks,
                 "groups": self.groups,
                 "interrupted": interrupted,
+                "course": self.course,
                 **self.said,
                 **described(self.known.layout, self.primitive.basis),
                 "settings": self.identity(),

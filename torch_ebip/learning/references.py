@@ -13,8 +13,7 @@ SLACK = 1e-4
 
 def ends(primitive: InteractionPrimitive) -> Tensor:
     """[N, D]: where the demonstrations of a primitive end, units of the DoFs."""
-    one = primitive.weights.new_ones(len(primitive))
-    return primitive.basis.project(one, primitive.weights)
+    return primitive.basis.project(primitive.first_phase + primitive.cycles, primitive.weights)
 
 
 def paths_after(primitive: InteractionPrimitive, time: Tensor, which: Tensor, dofs: Tensor) -> Tensor:
@@ -27,7 +26,7 @@ def paths_after(primitive: InteractionPrimitive, time: Tensor, which: Tensor, do
         dofs: bool [D], which DoFs.
     """
     used = dofs.to(primitive.weights.device)[primitive.basis.dof_of_weight().to(primitive.weights.device)]
-    phase = (time.to(primitive.phase_velocity) * primitive.phase_velocity[which]).clamp(max=1)
+    phase = primitive.phase_after(time.to(primitive.phase_velocity), which)
     return primitive.basis.select(dofs).project(phase, primitive.weights[:, used][which])
 
 
@@ -94,7 +93,8 @@ def nearest(
     used = observed.any(0).any(0)
     basis = primitive.basis.select(used)
     weights = primitive.weights[:, used.to(primitive.weights.device)[primitive.basis.dof_of_weight()]]
-    phase = torch.arange(y.shape[1], device=weights.device)[:, None] * dt * primitive.phase_velocity
+    time = torch.arange(y.shape[1], device=weights.device)[:, None] * dt
+    phase = primitive.first_phase + time * primitive.phase_velocity
     variance = primitive.value_variance[used]
     deviation = torch.where(variance > 0, variance, torch.inf).sqrt()
     paths = basis.project(phase, weights) / deviation

@@ -34,8 +34,9 @@ class Report(Mapping[str, Any]):
     after the read-out), ``best_step``, ``stopped_early``, ``shrinkage`` (mean shares by target and horizon),
     ``analogues`` and ``expert`` (whether they are used, their shares, the CRPS with and without them), ``horizons``,
     ``remarks`` (what was left out, and why), ``surprise`` (what of interactions left out is unusual, and what is then
-    said; empty where they were too few), ``pace`` (see `learn_pace`), ``basis``, ``settings``, ``versions``,
-    ``seconds``.
+    said; empty where they were too few), ``pace`` (see `learn_pace`), ``course`` (CRPS with a phase that goes on
+    ``once`` and with one on a ``circle``, where demonstrations seem to repeat), ``basis``, ``settings``,
+    ``versions``, ``seconds``.
 
     Args:
         content: plain values.

@@ -18,10 +18,12 @@ from torch_ebip.common.files import read_json, write_json
 from torch_ebip.filtering.noise.constraints import AboveOne
 from torch_ebip.filtering.updates.trust import RobustWeights
 from torch_ebip.interaction.basis.bspline import BSplineBasis
+from torch_ebip.interaction.basis.periodic import PeriodicBSplineBasis
 from torch_ebip.interaction.filter_kinds import InteractionEnsembleFilter
 from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.presets import ebip
 from torch_ebip.interaction.primitive import InteractionPrimitive
+from torch_ebip.learning.course import bank_of
 from torch_ebip.learning.held_out import HeldOut
 from torch_ebip.learning.remaining import remaining_error
 
@@ -81,7 +83,7 @@ def tunable(
         primitive,
         members,
         residual_variance=start.factor * primitive.residual_variance,
-        context=BSplineBasis(4),
+        context=PeriodicBSplineBasis(4) if primitive.periodic else BSplineBasis(4),
         robust=robust,
         inflation=AboveOne(primitive.weights.new_tensor(INFLATION)),
         square_root=True,
@@ -91,6 +93,7 @@ def tunable(
         primacy=0.0 if start.balance is None else (0.0, start.primacy),
         slope=start.slope,
         relative=1.0,
+        pace=bank_of(primitive),
     )
 
 

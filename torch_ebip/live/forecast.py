@@ -19,7 +19,7 @@ class SessionForecast(NamedTuple):
     Attributes:
         time: the present, s.
         phase: where in the interaction it is now, 0 to 1.
-        time_to_end: seconds until phase 1; infinite if the interaction stands still.
+        time_to_end: seconds until phase 1; infinite if the interaction stands still, or has no end.
         dofs: names of the controlled DoFs, D_c of them.
         mean, deviation: [D_c], or [P, D_c] for P horizons: expected values and their standard deviations.
         stale: names of the sensors of which nothing was used for a while, or ever.

@@ -85,7 +85,7 @@ class InteractionSession:
         self.dofs = tuple(dof for dof, ours in zip(layout.dofs, layout.controlled.tolist(), strict=True) if ours)
         self._numbers = {name: i for i, name in enumerate(self.sensors)}
         self._timeline = Timeline(filter, primitive, self.sensors, settings)
-        self._longest = float((1 / primitive.phase_velocity).max())
+        self._longest = float(primitive.durations.max())
         self._lock = threading.RLock()
         self._log: SessionLog | None = None
         if record is not None:
@@ -163,28 +163,20 @@ class InteractionSession:
             raise ValueError("a rate goes with one horizon, up to which the way is sampled, not with several")
         with self._lock:
             self._timeline.advance(now)
-            phase, velocity = self._timeline.phase_now()
-            rest = self._timeline.rest()
+            timeline = self._timeline
+            left = timeline.time_to_end()
             if rate is not None:
-                end = self._longest
-                if velocity > 0:
-                    end = min((1 - min(phase, 1.0)) / velocity + rest, self._longest)
+                end = min(left, self._longest)
                 horizons, several, horizon = sampled(horizons[0] if horizons else end, rate), True, 0.0
-            phases = [1.0]
-            if horizon is not None:
-                gone = self._timeline.gone(horizons)
-                phases = [min(max(phase + velocity * seconds, 0.0), 1.0) for seconds in gone]
-            expected = self._timeline.forecast(phases, horizons if horizon is not None else [math.inf])
+            expected = timeline.forecast(horizons if horizon is not None else [math.inf])
             mean, deviation = expected.mean, expected.variance.sqrt()
             if self._log is not None:
                 asked = horizons if several else horizons[0] if horizons else None
                 self._log.write(["forecast", now, asked, mean.tolist()])
             if not several:
                 mean, deviation = mean[0], deviation[0]
-            phase = min(max(phase, 0.0), 1.0)
-            left = (1 - phase) / velocity + rest if velocity > 0 else math.inf
-            now, stale = self._timeline.now, tuple(self.sensors[i] for i in self._timeline.stale())
-            timeline = self._timeline
+            phase = min(max(timeline.phase_now()[0], 0.0), 1.0)
+            now, stale = timeline.now, tuple(self.sensors[i] for i in timeline.stale())
             return SessionForecast(
                 now, phase, left, self.dofs, mean, deviation, stale, tuple(horizons),
                 timeline.labels(), timeline.familiarity(), dict(zip(self.sensors, timeline.states(), strict=True)),

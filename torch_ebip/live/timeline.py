@@ -60,7 +60,8 @@ class Timeline:
         self._engine = make_engine(filter, layout.mask(sensors), layout.controlled, self._slots + 1, settings.seed)
         self._engine.save(self._slots)
         self._like = next(filter.parameters())
-        longest = float((1 / primitive.phase_velocity).max())
+        longest = float(primitive.durations.max())
+        self._periodic = primitive.periodic
         self._clock = Clock(dt, longest, len(sensors))
         self._lost = Lost(settings.longest_gap) if isinstance(settings.start, str) else None
         self._opening = Opening(settings.window) if isinstance(settings.start, str) else None
@@ -160,26 +161,34 @@ class Timeline:
     def phase_now(self) -> tuple[float, float]:
         """Phase and its velocity, 1/s, at the present: since the last tick the interaction went on."""
         phase, velocity = self._engine.clock()
-        return phase + velocity * self.gone([self._since()])[0], velocity
+        waits, since = self._engine.waits(), self._since()
+        gone = since if waits is None else float(waits.gone(self._like.new_tensor([since])))
+        return phase + velocity * gone, velocity
 
-    def gone(self, seconds: Sequence[float]) -> list[float]:
-        """How long of so many seconds the interaction goes on, s."""
+    def time_to_end(self) -> float:
+        """Seconds until phase 1, of who stands still until they go on, too; infinite where there is no end."""
+        phase, velocity = self.phase_now()
+        if self._periodic or velocity <= 0:
+            return math.inf
         waits = self._engine.waits()
-        return list(seconds) if waits is None else waits.gone(self._like.new_tensor(seconds)).tolist()
+        rest = 0.0 if waits is None else float(waits.rest)
+        return (1 - min(max(phase, 0.0), 1.0)) / velocity + rest
 
-    def rest(self) -> float:
-        """How long it will stand still first, s."""
-        waits = self._engine.waits()
-        return 0.0 if waits is None else float(waits.rest)
+    def forecast(self, horizons: Sequence[float]) -> Forecast:
+        """Of the controlled DoFs so many seconds ahead of the present; infinity: the end.
 
-    def forecast(self, phases: Sequence[float], horizons: Sequence[float]) -> Forecast:
-        """Of the controlled DoFs at some phases, so many seconds ahead of the present; infinity: the end.
-
-        Of a person who may stand still the seconds count: how far they will get is not one phase.
+        Of a person who may stand still, and on a circle, seconds are asked for: how far they will get is not one
+        phase.
         """
-        if self._engine.waits() is None or min(horizons) < 0:
-            return self._engine.forecast(self._like.new_tensor(phases))
-        return self._engine.forecast_ahead(self._like.new_tensor(horizons) + self._since())
+        waits = self._engine.waits()
+        if (waits is not None or self._periodic) and min(horizons) >= 0:
+            return self._engine.forecast_ahead(self._like.new_tensor(horizons) + self._since())
+        phase, velocity = self.phase_now()
+        gone = horizons if waits is None else waits.gone(self._like.new_tensor(horizons)).tolist()
+        ahead = [1.0 if math.isinf(seconds) else phase + velocity * seconds for seconds in gone]
+        return self._engine.forecast(
+            self._like.new_tensor(ahead if self._periodic else [min(max(at, 0.0), 1.0) for at in ahead])
+        )
 
     def _since(self) -> float:
         """How long ago the last tick was, s."""

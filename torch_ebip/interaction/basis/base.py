@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -23,6 +24,8 @@ class Basis(nn.Module, ABC):
     """
 
     margin = 0.1
+    periodic: ClassVar[bool] = False
+    """Whether phases are those of a circle."""
     n_features: int
 
     def __init__(self, n_features: int) -> None:

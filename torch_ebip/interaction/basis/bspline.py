@@ -26,21 +26,28 @@ class BSplineBasis(Basis):
         ValueError: a negative degree, or fewer functions than degree + 1.
     """
 
-    pieces: Tensor  # [n_pieces, degree + 1, n_features], coefficients of powers of the local coordinate
+    pieces: Tensor
 
     def __init__(self, n_features: int, degree: int = 3) -> None:
         degree, n_features = as_count("degree of BSplineBasis", degree, 0), as_count("n_features", n_features)
         if n_features < degree + 1:
-            raise ValueError(f"BSplineBasis: degree {degree} needs n_features >= {degree + 1}, got {n_features}")
+            raise ValueError(
+                f"{type(self).__name__}: degree {degree} needs n_features >= {degree + 1}, got {n_features}"
+            )
         super().__init__(n_features)
         self.degree = degree
+        self.register_buffer("pieces", owned(self._pieces()), persistent=False)
+
+    def _pieces(self) -> Tensor:
+        """[n_pieces, degree + 1, n_features], coefficients of powers of the local coordinate."""
+        n_features, degree = self.n_features, self.degree
         pieces = n_features - degree
         # A piece is a polynomial of this degree in the local coordinate u in [0, 1]: found from degree + 1 points.
         points = torch.linspace(0, 1, degree + 2, dtype=torch.float64, device="cpu")[:-1] + 0.5 / (degree + 1)
         phases = (torch.arange(pieces, dtype=torch.float64, device="cpu")[:, None] + points) / pieces
         vandermonde = points[:, None] ** torch.arange(degree + 1, device="cpu")
-        values = _cox_de_boor(phases, n_features, degree)
-        self.register_buffer("pieces", owned(torch.linalg.solve(vandermonde, values).contiguous()), persistent=False)
+        found: Tensor = torch.linalg.solve(vandermonde, _cox_de_boor(phases, n_features, degree))
+        return found.contiguous()
 
     def evaluate(self, phase: Tensor) -> tuple[Tensor, Tensor]:
         """Values and slopes, from the polynomial pieces; see `Basis.evaluate`."""
@@ -50,7 +57,7 @@ class BSplineBasis(Basis):
             slopes = values if slopes is None else slopes * local + values
             values = values * local + coefficients[..., k, :]
         slopes = torch.zeros_like(values) if slopes is None else slopes
-        return values, slopes * (self.n_features - self.degree)
+        return values, slopes * len(self.pieces)
 
     def within(self, phase: Tensor) -> Tensor:
         """See `Basis.within`: without the slopes."""
@@ -62,7 +69,7 @@ class BSplineBasis(Basis):
 
     def _pieces_at(self, phase: Tensor) -> tuple[Tensor, Tensor]:
         """Coefficients [..., degree + 1, n_features] at phases [...], and the local coordinates [..., 1] there."""
-        pieces = self.n_features - self.degree
+        pieces = len(self.pieces)
         scaled = phase * pieces
         piece = scaled.detach().floor().long().clamp(0, pieces - 1)  # a phase that is NaN has one, too
         found = self.pieces.to(phase).index_select(0, piece.reshape(-1))

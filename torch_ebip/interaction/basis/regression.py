@@ -10,6 +10,7 @@ from torch import Tensor
 from torch_ebip.common.ambient import without_autocast
 from torch_ebip.common.brief import brief
 from torch_ebip.interaction.basis.base import Basis
+from torch_ebip.interaction.cycles import cycles_of
 from torch_ebip.recordings.demonstrations import Demonstrations
 
 GAP_WEIGHT = 1e-4
@@ -20,7 +21,7 @@ class Samples(NamedTuple):
     """Demonstrations as one float64 batch with their gaps filled, ready for regression.
 
     Attributes:
-        phase: [N, T], from 0 at the first sample to 1 at the last; 1 in the padding.
+        phase: [N, T], from 0 at the first sample to 1 at the last, and in the padding; or in cycles.
         values: [N, T, D]; gaps are interpolated linearly in time and held at the ends, 0 in the padding and
             where a demonstration has no measured value of that DoF at all.
         observed: bool [N, T, D], where a value was measured.
@@ -36,8 +37,16 @@ class Samples(NamedTuple):
         return brief(self)
 
 
-def samples_of(demonstrations: Demonstrations) -> Samples:
-    """Pad, fill the gaps and weigh. Raises ValueError for a DoF that no demonstration measured."""
+def samples_of(demonstrations: Demonstrations, periodic: bool = False) -> Samples:
+    """Pad, fill the gaps and weigh.
+
+    Args:
+        demonstrations: N of them.
+        periodic: whether they repeat: phases are then those that `cycles_of` finds.
+
+    Raises:
+        ValueError: a DoF that no demonstration measured; periodic ones that do not repeat, or hold less than a cycle.
+    """
     values, observed = demonstrations.to(dtype=torch.float64).pad()
     never = ~observed.any(1).any(0)
     if never.any():
@@ -49,6 +58,8 @@ def samples_of(demonstrations: Demonstrations) -> Samples:
     phase = (steps / (lengths - 1).to(values.dtype)).clamp(max=1)
     filled = torch.where(valid, _fill_gaps(values, observed), 0)
     weight = torch.where(observed, 1.0, GAP_WEIGHT).to(values.dtype) * valid
+    if periodic:
+        phase = cycles_of(filled, observed, lengths.squeeze(-1)).phase
     return Samples(phase, filled, observed, weight)
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch_ebip.interaction.basis.base import Basis
 from torch_ebip.interaction.basis.bspline import BSplineBasis
 from torch_ebip.interaction.basis.gaussian import GaussianBasis
+from torch_ebip.interaction.basis.periodic import FourierBasis, PeriodicBSplineBasis
 from torch_ebip.interaction.basis.polynomial import PolynomialBasis
 from torch_ebip.interaction.basis.regression import (
     Samples,
@@ -65,38 +66,56 @@ def default_candidates(sizes: Sequence[int] = (6, 8, 10, 12, 15)) -> list[Basis]
     return candidates
 
 
+def periodic_candidates(sizes: Sequence[int] = (5, 7, 9, 11, 15)) -> list[Basis]:
+    """Fourier series and B-splines on a circle, in these odd numbers of functions."""
+    bases: list[Basis] = [PeriodicBSplineBasis(size) for size in sizes]
+    return bases + [FourierBasis((size - 1) // 2) for size in sizes]
+
+
 def select_basis(
     demonstrations: Demonstrations,
     candidates: Sequence[Basis] | None = None,
     *,
     ranking: Sequence[CandidateFit] | None = None,
+    periodic: bool = False,
 ) -> StackedBasis:
     """For each modality the candidate with the smallest BIC; `rank_candidates` gives the table behind it.
 
     Args:
         demonstrations: all of them count.
-        candidates: default `default_candidates()`; those with more functions than the shortest demonstration
-            has samples are left out.
+        candidates: default `default_candidates()` or `periodic_candidates()`; those with more functions than the
+            shortest demonstration has samples are left out.
         ranking: what `rank_candidates` said of these demonstrations, if it is known already.
+        periodic: whether they repeat.
 
     Raises:
-        ValueError: no candidate is small enough, or a DoF was never measured.
+        ValueError: no candidate is small enough, or a DoF was never measured; some are periodic and others not, or
+            they are and the demonstrations do not repeat.
     """
     best: dict[str, CandidateFit] = {}
-    for row in rank_candidates(demonstrations, candidates) if ranking is None else ranking:
+    for row in rank_candidates(demonstrations, candidates, periodic) if ranking is None else ranking:
         best.setdefault(row.modality, row)
     layout = demonstrations.layout
     return StackedBasis([best[modality.name].basis for modality in layout.modalities for _ in modality.dofs])
 
 
-def rank_candidates(demonstrations: Demonstrations, candidates: Sequence[Basis] | None = None) -> list[CandidateFit]:
+def rank_candidates(
+    demonstrations: Demonstrations, candidates: Sequence[Basis] | None = None, periodic: bool = False
+) -> list[CandidateFit]:
     """Every candidate fitted to every modality: modalities in the layout's order, the best BIC first in each.
+
+    Args:
+        demonstrations, candidates, periodic: see `select_basis`.
 
     Raises:
         ValueError: as `select_basis`.
     """
     shortest = int(demonstrations.lengths.min())
-    offered = list(candidates) if candidates is not None else default_candidates()
+    usual = periodic_candidates if periodic else default_candidates
+    offered = list(candidates) if candidates is not None else usual()
+    kinds = {basis.periodic for basis in offered}
+    if len(kinds) > 1 or (periodic and kinds == {False}):
+        raise ValueError("candidates must all be periodic, for demonstrations that repeat, or none of them")
     usable = [basis for basis in offered if basis.n_features <= shortest]
     if not usable:
         sizes = sorted({basis.n_features for basis in offered})
@@ -104,7 +123,7 @@ def rank_candidates(demonstrations: Demonstrations, candidates: Sequence[Basis] 
             f"the shortest demonstration has {shortest} samples; none of the candidates with {sizes} functions "
             "is small enough for it"
         )
-    samples = samples_of(demonstrations)
+    samples = samples_of(demonstrations, True in kinds)
     # A DoF that never moves is fitted exactly by any basis: the floor keeps its logarithm finite. It is one of the
     # spread, because where the origin lies says nothing; and of the size where there is no spread.
     spread = measured_variance(samples, torch.finfo(demonstrations[0].dtype).eps)

@@ -38,7 +38,7 @@ class StackedBasis(nn.Module):
         bases: D of them; two with the same class and settings are equal.
 
     Raises:
-        ValueError: no basis.
+        ValueError: no basis; some periodic and others not.
     """
 
     def __init__(self, bases: Sequence[Basis]) -> None:
@@ -48,6 +48,8 @@ class StackedBasis(nn.Module):
         for basis in bases:
             if not isinstance(basis, Basis):
                 raise ValueError(f"StackedBasis needs bases, one for each DoF, got {basis!r}")
+        if len({basis.periodic for basis in bases}) > 1:
+            raise ValueError("phases are those of a circle for all DoFs or for none: some bases are periodic")
         unique = list(dict.fromkeys(bases))
         self.unique = nn.ModuleList(unique)
         self._basis_of_dof = tuple(unique.index(basis) for basis in bases)
@@ -61,6 +63,11 @@ class StackedBasis(nn.Module):
         """The basis of each DoF, D of them."""
         unique = self.families
         return tuple(unique[i] for i in self._basis_of_dof)
+
+    @property
+    def periodic(self) -> bool:
+        """Whether phases are those of a circle."""
+        return self.families[0].periodic
 
     @property
     def families(self) -> list[Basis]:

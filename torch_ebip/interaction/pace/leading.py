@@ -7,6 +7,7 @@ from torch import Tensor
 
 from torch_ebip.filtering.updates.pace import Placement
 from torch_ebip.filtering.updates.weighting import Seen
+from torch_ebip.interaction.course import apart, circular_of
 
 FLOOR = 0.02
 """Deviation of the phase, beside those of ensemble and bank, within which the two agree."""
@@ -17,16 +18,37 @@ STRANGE = 3.0, 6.0
 from which on it does not: who moves as nobody did is followed by the ensemble alone."""
 ANEW = 0.2
 """Phases by which an ensemble was wrong when all is forgotten that it has learned; of less a part is."""
+WIDER = 3.0, 6.0
+"""Times as wide as the bank up to which an ensemble that began anywhere is left alone, and from which on it is made
+as wide as that."""
 
 
-def belief_of(moments: Tensor, phases: Tensor) -> tuple[Tensor, Tensor]:
+def moments_of(phases: Tensor, periodic: bool) -> Tensor:
+    """[P, 2], of which expectations `belief_of` asks, at phases [P]: themselves and their squares, or sides on a
+    circle."""
+    if periodic:
+        angle = 2 * torch.pi * phases
+        return torch.stack([angle.cos(), angle.sin()], -1)
+    return torch.stack([phases, phases.square()], -1)
+
+
+def belief_of(moments: Tensor, phases: Tensor, periodic: bool) -> tuple[Tensor, Tensor]:
     """Mean and deviation [...] of a phase by its moments [..., 3]: no less than half a cell of phases [P]."""
-    mean, square = moments[..., 0], moments[..., 1]
-    return mean, (square - mean.square()).clamp(min=0.25 * float(phases[1]) ** 2).sqrt()
+    first, second, least = moments[..., 0], moments[..., 1], 0.5 * float(phases[1])
+    if periodic:
+        mean, deviation = circular_of(first, second)
+        return mean, deviation.clamp(min=least)
+    return first, (second - first.square()).clamp(min=least**2).sqrt()
 
 
 def placement_of(
-    belief: tuple[Tensor, Tensor], strange: Tensor, some: Tensor, seen: Seen, agree: Tensor
+    belief: tuple[Tensor, Tensor],
+    strange: Tensor,
+    some: Tensor,
+    seen: Seen,
+    agree: Tensor,
+    periodic: bool = False,
+    anywhere: bool = False,
 ) -> Placement | None:
     """Where members are led; None where nobody is.
 
@@ -36,14 +58,23 @@ def placement_of(
         some: [...], in [0, 1], how much news there is of each entry of a batch.
         seen: the sample, and the members.
         agree: [], deviations up to which the ensemble is believed.
+        periodic: whether phases are those of a circle.
+        anywhere: whether members begin at phases far from each other: who is much wider than the bank is led, too.
     """
     mean, deviation = belief
     variance = seen.moving[..., 0].var(-1, correction=0)
-    apart = mean - seen.mean[..., 0]
-    far = apart.abs() / (deviation.square() + variance + FLOOR**2).sqrt()
-    known = ((STRANGE[1] - strange) / (STRANGE[1] - STRANGE[0])).clamp(0, 1)
-    share = ((far - agree) / DIFFER).clamp(0, 1) * known * some
+    between = apart(mean - seen.mean[..., 0], periodic)
+    far = between.abs() / (deviation.square() + variance + FLOOR**2).sqrt()
+    known = ((STRANGE[1] - strange) / (STRANGE[1] - STRANGE[0])).clamp(0, 1) * some
+    share = ((far - agree) / DIFFER).clamp(0, 1) * known
+    wide = torch.maximum(deviation.square(), variance).sqrt()
+    forgets = (between.abs() / ANEW).clamp(max=1)
+    if anywhere:
+        times = variance.sqrt() / deviation.clamp(min=FLOOR)
+        narrows = ((times - WIDER[0]) / (WIDER[1] - WIDER[0])).clamp(0, 1) * known
+        more = narrows > share
+        share, wide = torch.where(more, narrows, share), torch.where(more, deviation, wide)
+        forgets = torch.where(more, 1, forgets)
     if not bool((share > 0).any()):
         return None
-    wide = torch.maximum(deviation.square(), variance).sqrt()
-    return Placement(share * apart, share, wide, share * (apart.abs() / ANEW).clamp(max=1))
+    return Placement(share * between, share, wide, share * forgets)

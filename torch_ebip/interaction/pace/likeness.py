@@ -33,6 +33,7 @@ class Likeness(nn.Module):
         error: [2, k], mean squares that are usual of values and velocities.
         dofs: int64 [k], which of the layout's DoFs these are.
         sensor_of_dof: int64 [k], numbered from 0.
+        periodic: whether phases are those of a circle.
 
     Attributes:
         order: int64 [S, w], the DoFs of each sensor; where it has fewer than w any, of no precision.
@@ -50,9 +51,16 @@ class Likeness(nn.Module):
     phases: Tensor
 
     def __init__(
-        self, values: Tensor, velocities: Tensor, error: Tensor, dofs: Tensor, sensor_of_dof: Tensor
+        self,
+        values: Tensor,
+        velocities: Tensor,
+        error: Tensor,
+        dofs: Tensor,
+        sensor_of_dof: Tensor,
+        periodic: bool = False,
     ) -> None:
         super().__init__()
+        self.periodic = periodic
         N, P, k = values.shape
         if velocities.shape != values.shape or error.shape != (2, k) or len(dofs) != k or len(sensor_of_dof) != k:
             raise ValueError(
@@ -80,7 +88,7 @@ class Likeness(nn.Module):
             ("precision", placed[1:].view(2, S, w)),
             ("farthest", FARTHEST / placed[1:].view(2, S, w).clamp(min=torch.finfo(values.dtype).tiny).sqrt()),
             ("order", order.view(S, w)),
-            ("phases", torch.linspace(0, 1, P, dtype=values.dtype, device=values.device)),
+            ("phases", torch.arange(P, dtype=values.dtype, device=values.device) / (P if periodic else P - 1)),
         ):
             self.register_buffer(name, owned(tensor), persistent=False)
         self.n_demonstrations, self.n_phases = N, P
@@ -129,17 +137,18 @@ def likeness_of(primitive: InteractionPrimitive, phases: int, most: int) -> tupl
 
     Args:
         primitive: of the demonstrations.
-        phases: P, evenly from 0 to 1.
+        phases: P, evenly from 0 to 1, which on a circle is 0 again.
         most: N at most.
 
     Raises:
         ValueError: no sensor moves.
     """
-    table = DemonstrationTable.of(primitive, phases)
+    periodic = primitive.periodic
+    table = DemonstrationTable.of(primitive, phases + periodic)
     layout = primitive.layout
     dofs = (~layout.controlled).nonzero().squeeze(-1).to(primitive.weights.device)
-    values = table.values[..., dofs]
-    velocities = table.slopes[..., dofs] * primitive.phase_velocity[:, None, None]
+    values = table.values[:, :phases, dofs]
+    velocities = table.slopes[:, :phases, dofs] * primitive.phase_velocity[:, None, None]
     spread = values.flatten(0, 1).std(0)
     moves = spread > STILL * values.abs().amax((0, 1))
     if not bool(moves.any()):
@@ -152,7 +161,7 @@ def likeness_of(primitive: InteractionPrimitive, phases: int, most: int) -> tupl
     samples = max(SLOPE_WINDOW * primitive.rate, 1.0)
     error = error + torch.stack([noise / samples, 2 * noise / samples / SLOPE_WINDOW**2])
     which = _spread_out(values / spread, most)
-    return Likeness(values[which], velocities[which], error, dofs, sensors), which
+    return Likeness(values[which], velocities[which], error, dofs, sensors, periodic), which
 
 
 def _usual(values: Tensor, velocities: Tensor) -> Tensor:

@@ -20,11 +20,12 @@ from torch_ebip.filtering.model import StateSpace
 from torch_ebip.filtering.protocols import View
 from torch_ebip.filtering.updates.pace import Pace, Placement
 from torch_ebip.filtering.updates.weighting import Seen
+from torch_ebip.interaction.pace.beginning import begin_of
 from torch_ebip.interaction.pace.leading import belief_of, placement_of
 from torch_ebip.interaction.pace.likeness import Likeness, likeness_of
 from torch_ebip.interaction.pace.moves import Moves, moves_of, transition_of
 from torch_ebip.interaction.pace.waiting import Waits
-from torch_ebip.interaction.pace.whereabouts import Whereabouts, chosen, closed
+from torch_ebip.interaction.pace.whereabouts import Whereabouts, chosen, closed, summed
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.recordings.layout import Layout
 
@@ -43,6 +44,8 @@ FIRST, DUE, NEARLY = 0.9996, 0.9995, 0.0002
 SHORTEST, WIDEST = 1e-3, 0.3
 """s, between two values that have a velocity: over longer gaps it is none of the present. Bank and samples may be far
 apart in time: periods are `LONGEST` at most, and thinned recordings have less than that many samples."""
+SOME = 0.3
+"""Share of all phases at which interactions begin, of more than which members are far from each other at first."""
 HELD = 0.4, 0.8
 """Probability of standing still from which on the ensemble's clock is held, and from which on altogether: it would be
 behind if it were held a little all the time."""
@@ -69,6 +72,7 @@ class PhaseBank(Pace):
         which: int64 [N], which of the prior's states they are.
         n_dofs: D, of the layout.
         n_all: how many states the prior has.
+        begin: [P], probability of each phase where an interaction begins; default: at phase 0.
         stop: times a second that a person stops.
         go: times a second that one who stands goes on.
         jump: times a second that a person starts over, or is somewhere else.
@@ -85,6 +89,7 @@ class PhaseBank(Pace):
     which: Tensor
     columns: Tensor
     transition: Tensor
+    begin: Tensor
 
     def __init__(
         self,
@@ -93,6 +98,7 @@ class PhaseBank(Pace):
         which: Tensor,
         n_dofs: int,
         n_all: int,
+        begin: Tensor | None = None,
         stop: float = 0.3,
         go: float = 1.0,
         jump: float = 0.02,
@@ -114,8 +120,11 @@ class PhaseBank(Pace):
         self.register_buffer("which", owned(which), persistent=False)
         self.n_dofs, self.n_all = n_dofs, n_all
         self.register_buffer("columns", torch.arange(n_dofs, device=pace.device), persistent=False)
-        moves = transition_of(pace, likeness.n_phases, self.period)
+        moves = transition_of(pace, likeness.n_phases, self.period, likeness.periodic)
         self.register_buffer("transition", moves, persistent=False)
+        begin = (likeness.phases == 0).to(pace) if begin is None else begin
+        self.register_buffer("begin", owned(begin), persistent=False)
+        self.anywhere = int((begin > 0).sum()) > SOME * len(begin)
         self._settled: tuple[Tensor, int, Moves] | None = None
 
     @classmethod
@@ -129,10 +138,17 @@ class PhaseBank(Pace):
             settings: see `PhaseBank`; the period is `LONGEST` at most, and one of `STEPS` of an interaction.
         """
         likeness, which = likeness_of(primitive, as_count("phases", phases, 2), as_count("most", most, 1))
+        begin = begin_of(primitive.first_phase, likeness.phases, likeness.periodic)
         usual = 1 / float(primitive.phase_velocity.mean())
         settings = {"period": min(LONGEST, usual / STEPS), **settings}
         return cls(
-            likeness, primitive.phase_velocity[which], which, primitive.layout.n_dofs, len(primitive), **settings
+            likeness,
+            primitive.phase_velocity[which],
+            which,
+            primitive.layout.n_dofs,
+            len(primitive),
+            begin,
+            **settings,
         )
 
     def check(self, model: StateSpace) -> None:
@@ -166,10 +182,8 @@ class PhaseBank(Pace):
         return Whereabouts(self._begin(own, late), anywhere, sums, sums, none + IDLE, none + FIRST * self.period)
 
     def _begin(self, own: Tensor, late: Tensor) -> Tensor:
-        """[..., N, 2 P], where those of demonstrations [..., N] begin: at phase 0, a share of them anywhere."""
-        P = self.likeness.n_phases
-        place = (late / P).expand(P)
-        place = torch.cat([place[:1] + 1 - late, place[1:]])
+        """[..., N, 2 P], where those of demonstrations [..., N] begin: see ``begin``; a share of them anywhere."""
+        place = (1 - late) * self.begin + late / len(self.begin)
         return own.unsqueeze(-1) * torch.cat([(1 - IDLE) * place, IDLE * place])
 
     def elapse(self, memory: Whereabouts, dt: Tensor) -> tuple[Whereabouts, Tensor]:
@@ -198,7 +212,8 @@ class PhaseBank(Pace):
 
     def notice(self, memory: Whereabouts, seen: Seen) -> tuple[Whereabouts, Placement | None]:
         """See `Pace.notice`."""
-        kept = memory._replace(sums=self._summed(memory, seen))
+        columns = self.columns if seen.rows is None else self.columns[seen.rows]
+        kept = memory._replace(sums=summed(memory, seen, columns))
         some = memory.clock >= DUE * self.period
         if seen.observed is not None:
             some = some & seen.observed.any(-1)
@@ -217,17 +232,9 @@ class PhaseBank(Pace):
         strange = ((share[..., :P] + share[..., P:]) * distance).sum((-2, -1))
         # Where somebody is whose velocity nobody knows is guessed: after a silence the ensemble knows better.
         news = some * moves
-        return stepped, placement_of(belief_of(moments, self.likeness.phases), strange, news, seen, self.settings[6])
-
-    def _summed(self, memory: Whereabouts, seen: Seen) -> Tensor:
-        """Sums [..., 3, D] with a sample."""
-        columns = self.columns if seen.rows is None else self.columns[seen.rows]
-        value, sums = seen.y, memory.sums
-        one = torch.ones_like(value)
-        if seen.observed is not None:
-            value, one = torch.where(seen.observed, value, 0), seen.observed.to(value)
-        added = torch.stack([one, one * memory.clock.unsqueeze(-1), value], -2)
-        return sums.index_add(-1, columns, added.expand(*sums.shape[:-1], added.shape[-1]))
+        belief = belief_of(moments, self.likeness.phases, self.likeness.periodic)
+        agree, periodic = self.settings[6], self.likeness.periodic
+        return stepped, placement_of(belief, strange, news, seen, agree, periodic, self.anywhere)
 
     def _passed(self, memory: Whereabouts, steps: Tensor) -> Tensor:
         """Shares [..., N, 2 P] after so many steps [...]."""
@@ -263,14 +270,16 @@ class PhaseBank(Pace):
 
     def belief(self, memory: Whereabouts) -> tuple[Tensor, Tensor]:
         """Mean and deviation of the phase, [...] each, by what the bank remembers."""
-        return belief_of(memory.share.sum(-2) @ self._moves().moments, self.likeness.phases)
+        moments = memory.share.sum(-2) @ self._moves().moments
+        return belief_of(moments, self.likeness.phases, self.likeness.periodic)
 
     def _moves(self) -> Moves:
         """What depends on the settings alone, kept while they stay as they are."""
         settings, known = self.settings, self._settled
         version = -1 if settings.is_inference() else settings._version
         if known is None or version < 0 or known[0] is not settings or known[1] != version:
-            made = moves_of(settings[:3], self.transition, self.likeness.phases, self.period)
+            phases, periodic = self.likeness.phases, self.likeness.periodic
+            made = moves_of(settings[:3], self.transition, phases, self.period, periodic)
             self._settled = known = settings, version, made
         return known[2]
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_ebip.common.brief import brief
+from torch_ebip.filtering.updates.weighting import Seen
 
 
 class Whereabouts(NamedTuple):
@@ -31,6 +32,16 @@ class Whereabouts(NamedTuple):
 
     def __repr__(self) -> str:
         return brief(self)
+
+
+def summed(memory: Whereabouts, seen: Seen, columns: Tensor) -> Tensor:
+    """Sums [..., 3, D] of a memory with a sample of the DoFs int64 [k] that are its ``columns``."""
+    value, sums = seen.y, memory.sums
+    one = torch.ones_like(value)
+    if seen.observed is not None:
+        value, one = torch.where(seen.observed, value, 0), seen.observed.to(value)
+    added = torch.stack([one, one * memory.clock.unsqueeze(-1), value], -2)
+    return sums.index_add(-1, columns, added.expand(*sums.shape[:-1], added.shape[-1]))
 
 
 def closed(memory: Whereabouts, clock: Tensor) -> Tensor:

@@ -70,10 +70,9 @@ class AcceleratingPhase(PhaseModel):
         return moving.select(-1, 1)
 
     def first(self, primitive: InteractionPrimitive) -> Tensor:
-        """Phase 0, the phase velocity of each demonstration, no acceleration: [N, 3]."""
+        """First phase and phase velocity of each demonstration, no acceleration: [N, 3]."""
         velocity = primitive.phase_velocity
-        none = torch.zeros_like(velocity)
-        return torch.stack([none, velocity, none], dim=-1)
+        return torch.stack([primitive.first_phase, velocity, torch.zeros_like(velocity)], dim=-1)
 
     def noise(self, primitive: InteractionPrimitive) -> PhaseJerk:
         """White jerk that over one interaction adds a tenth of the demonstrations' spread of velocities.

@@ -33,9 +33,8 @@ class ConstantVelocityPhase(PhaseModel):
         return moving.select(-1, 1)
 
     def first(self, primitive: InteractionPrimitive) -> Tensor:
-        """Phase 0 and the phase velocity of each demonstration, [N, 2]."""
-        velocity = primitive.phase_velocity
-        return torch.stack([torch.zeros_like(velocity), velocity], dim=-1)
+        """First phase and phase velocity of each demonstration, [N, 2]."""
+        return torch.stack([primitive.first_phase, primitive.phase_velocity], dim=-1)
 
     def noise(self, primitive: InteractionPrimitive) -> PhaseNoise:
         """White accelerations that over one interaction add a tenth of the demonstrations' spread of velocities.

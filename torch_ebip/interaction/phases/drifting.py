@@ -66,8 +66,8 @@ class DriftingPhase(PhaseModel):
         return self.drift.value.expand(moving.shape[:-1])
 
     def first(self, primitive: InteractionPrimitive) -> Tensor:
-        """Phase 0 for each demonstration of a primitive, [N, 1]."""
-        return torch.zeros_like(primitive.phase_velocity).unsqueeze(-1)
+        """The first phase of each demonstration of a primitive, [N, 1]."""
+        return primitive.first_phase.unsqueeze(-1)
 
     def noise(self, primitive: InteractionPrimitive) -> PhaseWalk:
         """A walk that over one interaction spreads phases as far as the demonstrations' velocities do."""

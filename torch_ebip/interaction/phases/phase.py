@@ -38,6 +38,8 @@ class PhaseModel(FastTwins, nn.Module, ABC):
     }
     makes_new_members: ClassVar[bool] = True
     """Its result is never its argument, so that noise can be added in place."""
+    periodic: ClassVar[bool] = False
+    """Whether phases are those of a circle."""
 
     def __init__(self, overrun: float = 0.05) -> None:
         super().__init__()

@@ -1,0 +1,47 @@
+"""The two courses of a phase: from 0 to 1, where an interaction is over, or round a circle, where it goes on.
+
+On a circle phases are real numbers, too, and those that differ by whole cycles mean the same.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def within(phase: Tensor, periodic: bool) -> Tensor:
+    """Phases [...] as they are looked up in tables from 0 to 1: held at both ends, or without whole cycles."""
+    return phase - phase.detach().floor() if periodic else phase.clamp(0, 1)
+
+
+def apart(difference: Tensor, periodic: bool) -> Tensor:
+    """Differences [...] of phases: as they are, or the shorter way round, within -1/2 and 1/2."""
+    return difference - difference.detach().round() if periodic else difference
+
+
+def ends(phase: Tensor, end: Tensor, periodic: bool) -> Tensor:
+    """Phases [..., K] of K cases, where an ``end`` [..., K] is asked for 1; on a circle, which has no end, evenly
+    spread over it."""
+    if not periodic:
+        return torch.where(end, 1, phase)
+    K = phase.shape[-1]
+    even = (torch.arange(K, device=phase.device, dtype=phase.dtype) + 0.5) / K
+    return torch.where(end, even, phase)
+
+
+def circular(shares: Tensor, phases: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and deviation [...] on a circle of probabilities [..., P] of phases [P], in cycles.
+
+    The deviation is that of the wrapped normal distribution with as long a mean vector (Mardia & Jupp 2000, section
+    2.3).
+    """
+    angle = 2 * torch.pi * phases
+    return circular_of((shares * angle.cos()).sum(-1), (shares * angle.sin()).sum(-1))
+
+
+def circular_of(cosine: Tensor, sine: Tensor) -> tuple[Tensor, Tensor]:
+    """The same of the mean ``cosine`` and ``sine`` [...] of phases: mean in [0, 1), deviation, in cycles."""
+    turn = 2 * torch.pi
+    mean = torch.atan2(sine, cosine) / turn
+    length = torch.hypot(cosine, sine).clamp(1e-6, 1 - 1e-9)
+    return mean - mean.detach().floor(), (-2 * length.log()).sqrt() / turn

@@ -1,0 +1,120 @@
+"""What a learning stands on: a basis, a phase, a primitive, and what is asked of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from torch_ebip.interaction.basis.selection import CandidateFit, rank_candidates, select_basis
+from torch_ebip.interaction.basis.stacked import StackedBasis
+from torch_ebip.interaction.primitive import InteractionPrimitive
+from torch_ebip.kinematics import RobotArm
+from torch_ebip.learning.configuration import Task
+from torch_ebip.learning.course import course_error, why_not_periodic
+from torch_ebip.learning.groups import labelled
+from torch_ebip.learning.held_out import HeldOut
+from torch_ebip.learning.horizons import horizon_name, reached
+from torch_ebip.learning.losses import ForwardKinematicsLoss
+from torch_ebip.learning.objective import objective_for
+from torch_ebip.learning.ranks import Ranks
+from torch_ebip.learning.settings import TuningSettings
+from torch_ebip.recordings.demonstrations import Demonstrations
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a caller asked for.
+
+    Attributes:
+        targets: names of modalities.
+        subsets: sets of sensors, names of modalities by the name of the set.
+        ahead: horizons, s.
+        arm, joints: see `learn`.
+    """
+
+    targets: tuple[str, ...]
+    subsets: Mapping[str, tuple[str, ...]]
+    ahead: tuple[float, ...]
+    arm: RobotArm | ForwardKinematicsLoss | None = None
+    joints: str | None = None
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What a learning stands on.
+
+    Attributes:
+        known: the demonstrations, with labels where there are any.
+        primitive: of them.
+        task, held_out: what is asked.
+        ranking: of bases; None where one was given.
+        remarks: what there is to say.
+        course: CRPS by the phase that was tried, ``once`` and ``circle``; empty where only one was.
+    """
+
+    known: Demonstrations
+    primitive: InteractionPrimitive
+    task: Task
+    held_out: HeldOut
+    ranking: Sequence[CandidateFit] | None
+    remarks: list[str]
+    course: dict[str, float] = field(default_factory=dict)
+
+
+def prepared(
+    known: Demonstrations,
+    asked: Asked,
+    basis: StackedBasis | None,
+    periodic: bool | None,
+    settings: TuningSettings,
+    ranks: Ranks,
+) -> Prepared:
+    """Basis, phase, primitive and task.
+
+    Args:
+        known: the demonstrations.
+        asked: of them.
+        basis: default: the best by BIC.
+        periodic: whether they repeat; default: as the basis says, or as their forecasts do, of interactions left out.
+        settings: of ensembles and draws.
+        ranks: the processes that share the work.
+
+    Raises:
+        ValueError: periodic demonstrations that do not repeat, or hold less than a cycle; see `learn`.
+    """
+    if basis is not None or periodic is not None:
+        return _fitted(known, asked, basis, bool(periodic), settings, ranks)
+    once = _fitted(known, asked, None, False, settings, ranks)
+    if why_not_periodic(known) is not None:
+        return once
+    circle = _fitted(known, asked, None, True, settings, ranks)
+    scale = once.task.objective.scale
+    errors = [course_error(each.held_out, scale) for each in (once, circle)]
+    best = once if errors[0] <= errors[1] else circle
+    best.course.update({"once": round(errors[0], 5), "circle": round(errors[1], 5)})
+    return best
+
+
+def _fitted(
+    known: Demonstrations,
+    asked: Asked,
+    basis: StackedBasis | None,
+    periodic: bool,
+    settings: TuningSettings,
+    ranks: Ranks,
+) -> Prepared:
+    layout = known.layout
+    ranking = None if basis is not None else rank_candidates(known, periodic=periodic)
+    basis = select_basis(known, ranking=ranking) if basis is None else basis
+    primitive = InteractionPrimitive.fit(known, basis, periodic=periodic).to(ranks.device)
+    targets = layout.mask(asked.targets).to(primitive.weights.device)
+    known, remarks = labelled(known, primitive, settings.seed, ranks)
+    primitive.labels = known.labels
+    there = reached(primitive, asked.ahead)
+    short = ", ".join(horizon_name(a) for a in asked.ahead if a not in there)
+    if short:
+        remarks.append(f"not scored, because hardly any demonstration goes on for so long: {short}")
+    objective = objective_for(primitive, targets, asked.targets, there, asked.arm, asked.joints)
+    masks = {name: layout.mask(names).to(targets.device) for name, names in asked.subsets.items()}
+    task = Task(primitive, objective, targets, masks)
+    return Prepared(known, primitive, task, HeldOut(known, task, settings, ranks), ranking, remarks)
