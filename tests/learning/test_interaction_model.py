@@ -314,3 +314,12 @@ def test_a_description_of_something_else_is_refused_though_its_sum_is_right(tmp_
         with pytest.raises(ValueError, match="m: a model whose parts do not fit together"):
             load_model(path)
     assert (KIND, VERSION) == ("torch_ebip model", 8)
+
+
+def test_a_filter_that_does_not_weigh_forecasts_labelled_interactions_too() -> None:
+    made = interactions(8)
+    labelled = Demonstrations(made.layout, list(made), made.rate, labels=["wave"] * 4 + ["point"] * 4)
+    primitive = InteractionPrimitive.fit(labelled)
+    said = InteractionModel(ebip(primitive), primitive).forecast(made[0], [0.1])
+    assert said.mean.isfinite().all()
+    assert said.labels is None

@@ -58,7 +58,9 @@ def forecast_recorded(
         means.append(said.mean)
         variances.append(said.variance)
         phases.append(said.phase)
-        if filter.recognition is not None:
+        # A filter that does not weigh its members cannot say, and is not asked: its forecasts are as good.
+        memory = getattr(trace.kept, "memory", None)
+        if filter.recognition is not None and memory is not None and memory.weighting is not None:
             for label, probability in filter.recognise(trace.kept).items():
                 labels.setdefault(label, []).append(probability)
     together = {label: torch.cat(parts) for label, parts in labels.items()} or None
