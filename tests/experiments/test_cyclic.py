@@ -51,10 +51,13 @@ def test_the_command_at_a_small_size(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 def test_ratios_are_of_the_same_people() -> None:
+    usual = {"beginning": "anywhere", "inside": 0.9, "phase": 0.01}
     answers = [
-        {"method": m, "beginning": "anywhere", "number": n, "ahead": a, "squared": s * (n + 1), "inside": 0.9, "phase": 0.01}
-        for m, s in zip(METHODS, (1.0, 4.0, 1.0, 2.0), strict=True) for n in range(5) for a in AHEAD
-    ]  # fmt: skip
+        {**usual, "method": method, "number": n, "ahead": ahead, "squared": square * (n + 1)}
+        for method, square in zip(METHODS, (1.0, 4.0, 1.0, 2.0), strict=True)
+        for n in range(5)
+        for ahead in AHEAD
+    ]
     rows = {(row["method"], row["ahead"]): row for row in summarise(answers, 0)}
     assert rows["ebip_tuned", 0.5]["ratio"] == pytest.approx(0.5)
     assert rows["ebip_tuned", 0.5]["low"] == pytest.approx(0.5)

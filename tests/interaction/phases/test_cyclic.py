@@ -207,8 +207,9 @@ def test_both_engines_and_the_live_path_give_the_same() -> None:
 def test_people_who_begin_anywhere_are_found_within_a_third_of_a_cycle(seed: int) -> None:
     primitive = small_circle(torch.float64, True)
     bank = PhaseBank.of(primitive)
-    assert bank.anywhere
-    assert not PhaseBank.of(small_circle(torch.float64)).anywhere
+    torch.testing.assert_close(bank.begin.sum(), torch.tensor(1.0).double())
+    assert int((bank.begin > 0).sum()) > 15
+    assert int((PhaseBank.of(small_circle(torch.float64)).begin > 0).sum()) < 7
     others = waving(12, seed=seed, anywhere=True, dtype=torch.float64)
     off = []
     for pace in (bank, None):
@@ -295,3 +296,22 @@ def test_means_and_differences_on_a_circle() -> None:
     assert within(torch.tensor([-0.25, 1.25]), True).tolist() == [0.75, 0.25]
     assert within(torch.tensor([-0.25, 1.25]), False).tolist() == [0.0, 1.0]
     assert apart(torch.tensor([0.75, -0.25]), False).tolist() == [0.75, -0.25]
+
+
+def test_members_that_are_all_round_the_circle_are_brought_together() -> None:
+    """With an R that says next to nothing and an inflation they spread ever more: the bank knows where people are."""
+    primitive = small_circle(torch.float64)
+    variance = 1e4 * primitive.residual_variance
+    wide = []
+    others = waving(6, seed=3, dtype=torch.float64)
+    for pace in (PhaseBank.of(primitive), None):
+        made = ebip(primitive, residual_variance=variance, square_root=True, inflation=1.02, pace=pace)
+        off = []
+        for values, true in zip(others.recordings, others.phases, strict=True):
+            with torch.no_grad():
+                y = torch.where(HUMAN, values, torch.nan)
+                trace = made(y, generator=torch.Generator().manual_seed(0))
+            off.append(apart(trace.phase - true, True)[10:].square().mean())
+        wide.append(float(torch.stack(off).mean().sqrt()))
+    assert wide[0] < 0.08
+    assert wide[1] > 3 * wide[0]

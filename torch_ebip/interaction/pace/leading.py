@@ -18,8 +18,8 @@ STRANGE = 3.0, 6.0
 from which on it does not: who moves as nobody did is followed by the ensemble alone."""
 ANEW = 0.2
 """Phases by which an ensemble was wrong when all is forgotten that it has learned; of less a part is."""
-WIDER = 3.0, 6.0
-"""Times as wide as the bank up to which an ensemble that began anywhere is left alone, and from which on it is made
+WIDER = 2.0, 4.0
+"""Times as wide as the bank up to which an ensemble that may be anywhere is left alone, and from which on it is made
 as wide as that."""
 
 
@@ -48,7 +48,7 @@ def placement_of(
     seen: Seen,
     agree: Tensor,
     periodic: bool = False,
-    anywhere: bool = False,
+    narrows: bool = False,
 ) -> Placement | None:
     """Where members are led; None where nobody is.
 
@@ -59,7 +59,8 @@ def placement_of(
         seen: the sample, and the members.
         agree: [], deviations up to which the ensemble is believed.
         periodic: whether phases are those of a circle.
-        anywhere: whether members begin at phases far from each other: who is much wider than the bank is led, too.
+        narrows: whether members may be at phases far from each other, because they begin there, or by coming round a
+            circle: who is much wider than the bank is led, too. Linear updates are of no use to them.
     """
     mean, deviation = belief
     variance = seen.moving[..., 0].var(-1, correction=0)
@@ -69,12 +70,13 @@ def placement_of(
     share = ((far - agree) / DIFFER).clamp(0, 1) * known
     wide = torch.maximum(deviation.square(), variance).sqrt()
     forgets = (between.abs() / ANEW).clamp(max=1)
-    if anywhere:
-        times = variance.sqrt() / deviation.clamp(min=FLOOR)
-        narrows = ((times - WIDER[0]) / (WIDER[1] - WIDER[0])).clamp(0, 1) * known
-        more = narrows > share
-        share, wide = torch.where(more, narrows, share), torch.where(more, deviation, wide)
-        forgets = torch.where(more, 1, forgets)
+    if narrows:
+        own = variance.sqrt()
+        excess = (own / deviation.clamp(min=FLOOR) - WIDER[0]) / (WIDER[1] - WIDER[0])
+        narrowed = excess.clamp(0, 1) * known
+        more = narrowed > share
+        share, wide = torch.where(more, narrowed, share), torch.where(more, deviation, wide)
+        forgets = torch.where(more, (own / ANEW).clamp(max=1), forgets)
     if not bool((share > 0).any()):
         return None
     return Placement(share * between, share, wide, share * forgets)

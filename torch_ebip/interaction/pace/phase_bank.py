@@ -124,7 +124,7 @@ class PhaseBank(Pace):
         self.register_buffer("transition", moves, persistent=False)
         begin = (likeness.phases == 0).to(pace) if begin is None else begin
         self.register_buffer("begin", owned(begin), persistent=False)
-        self.anywhere = int((begin > 0).sum()) > SOME * len(begin)
+        self.narrows = likeness.periodic or int((begin > 0).sum()) > SOME * len(begin)
         self._settled: tuple[Tensor, int, Moves] | None = None
 
     @classmethod
@@ -234,7 +234,7 @@ class PhaseBank(Pace):
         news = some * moves
         belief = belief_of(moments, self.likeness.phases, self.likeness.periodic)
         agree, periodic = self.settings[6], self.likeness.periodic
-        return stepped, placement_of(belief, strange, news, seen, agree, periodic, self.anywhere)
+        return stepped, placement_of(belief, strange, news, seen, agree, periodic, self.narrows)
 
     def _passed(self, memory: Whereabouts, steps: Tensor) -> Tensor:
         """Shares [..., N, 2 P] after so many steps [...]."""
