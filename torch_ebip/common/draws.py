@@ -14,6 +14,8 @@ from torch import Tensor
 
 Generators: TypeAlias = torch.Generator | Sequence[torch.Generator] | None
 """One generator; or one for each entry of the first batch dimension; or torch's global one."""
+GOLDEN = 0.6180339887498949
+"""Multiples of it, less their whole part, are evenly spread, in an order that nothing else has."""
 
 
 def standard_normal(shape: Sequence[int], like: Tensor, generator: Generators) -> Tensor:

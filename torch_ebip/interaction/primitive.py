@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torch_ebip.common.ambient import in_own_modes, owned
-from torch_ebip.common.arguments import as_indices
+from torch_ebip.common.arguments import as_indices, as_values
+from torch_ebip.common.draws import GOLDEN
 from torch_ebip.common.meaning import Meaning
 from torch_ebip.interaction.basis.regression import (
     Samples,
@@ -23,6 +25,9 @@ from torch_ebip.interaction.basis.stacked import StackedBasis
 from torch_ebip.recordings.demonstrations import Demonstrations
 from torch_ebip.recordings.layout import Layout
 from torch_ebip.recordings.repeats import longest_repeats
+
+OF_EACH = ("weights", "phase_velocity", "first_phase", "cycles")
+"""What a primitive knows of each demonstration."""
 
 
 class InteractionPrimitive(Meaning):
@@ -230,20 +235,45 @@ class InteractionPrimitive(Meaning):
         # A primitive is of two at least: of one, the second is the same again.
         several = demonstrations if len(demonstrations) > 1 else demonstrations.subset([0, 0])
         more = InteractionPrimitive.fit(several, self.basis)
-        return InteractionPrimitive(
-            self.layout,
-            self.basis,
-            self.rate,
-            torch.cat([self.weights, more.weights[: len(demonstrations)]]),
-            torch.cat([self.phase_velocity, more.phase_velocity[: len(demonstrations)]]),
-            self.residual_variance,
-            self.residual_correlation_time,
-            self.value_variance,
-            torch.maximum(self.longest_repeat, more.longest_repeat),
-            None if self.labels is None or demonstrations.labels is None else (*self.labels, *demonstrations.labels),
-            torch.cat([self.first_phase, more.first_phase[: len(demonstrations)]]),
-            torch.cat([self.cycles, more.cycles[: len(demonstrations)]]),
+        both = self.labels is not None and demonstrations.labels is not None
+        return self._with(
+            labels=(*(self.labels or ()), *(demonstrations.labels or ())) if both else None,
+            longest_repeat=torch.maximum(self.longest_repeat, more.longest_repeat),
+            **{
+                name: torch.cat([getattr(self, name), getattr(more, name)[: len(demonstrations)]]) for name in OF_EACH
+            },
         )
+
+    def starting_at(self, phases: Sequence[float] | Tensor) -> InteractionPrimitive:
+        """The same demonstrations, as of people who are first seen at one of some phases, each as likely.
+
+        Filters and phase banks of it start there: the demonstrations have the phases in turn, evenly and in no order.
+
+        Args:
+            phases: [K], in [0, 1).
+
+        Raises:
+            ValueError: none at all, or phases outside [0, 1).
+
+        Example:
+            >>> from torch_ebip import InteractionPrimitive
+            >>> from torch_ebip.recordings import example
+            >>> loose = InteractionPrimitive.fit(example()).starting_at([0.0, 0.25, 0.5])
+            >>> sorted(set(loose.first_phase.tolist()))
+            [0.0, 0.25, 0.5]
+        """
+        start = as_values("phases", phases, None, self.weights).to(self.weights)
+        if start.ndim != 1 or not len(start) or not bool(((start >= 0) & (start < 1)).all()):
+            raise ValueError(f"interactions begin at phases in [0, 1), got {start.tolist()}")
+        rank = (torch.arange(len(self), dtype=torch.float64, device=start.device) * GOLDEN % 1).argsort().argsort()
+        first = start.sort().values[rank * len(start) // len(self)]
+        return self._with(first_phase=first, cycles=self.cycles if self.periodic else 1 - first)
+
+    def _with(self, **others: Any) -> InteractionPrimitive:
+        """The same with some other arguments by name."""
+        own = dict(self.named_buffers(recurse=False))
+        arguments = {"layout": self.layout, "basis": self.basis, "rate": self.rate, "labels": self.labels, **own}
+        return InteractionPrimitive(**{**arguments, **others})
 
     def subset(self, indices: Sequence[int] | Sequence[bool] | Tensor) -> InteractionPrimitive:
         """The same basis and noise with some of the demonstrations: they need no new regression.
@@ -255,17 +285,5 @@ class InteractionPrimitive(Meaning):
             ValueError: an index out of range, a mask of another length, fractions.
         """
         indices = as_indices("demonstration", indices, len(self)).to(self.weights.device)
-        return InteractionPrimitive(
-            self.layout,
-            self.basis,
-            self.rate,
-            self.weights[indices],
-            self.phase_velocity[indices],
-            self.residual_variance,
-            self.residual_correlation_time,
-            self.value_variance,
-            self.longest_repeat,
-            None if self.labels is None else [self.labels[i] for i in indices.tolist()],
-            self.first_phase[indices],
-            self.cycles[indices],
-        )
+        labels = None if self.labels is None else [self.labels[i] for i in indices.tolist()]
+        return self._with(labels=labels, **{name: getattr(self, name)[indices] for name in OF_EACH})

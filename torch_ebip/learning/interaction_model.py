@@ -250,6 +250,18 @@ class InteractionModel:
         fill(filter, own_tensors(self.filter, build_filter(mine, description)))
         return replace(self, filter=filter, primitive=primitive, report=report, labels=primitive.labels)
 
+    def starting_at(self, phases: Sequence[float]) -> InteractionModel:
+        """The same model for people who are first seen at one of some ``phases`` in [0, 1), each as likely: see
+        `InteractionPrimitive.starting_at`.
+
+        Raises:
+            ValueError: phases outside [0, 1).
+        """
+        primitive, description = self.primitive.starting_at(phases), describe_filter(self.filter, self.primitive)
+        filter = build_filter(primitive, description)
+        fill(filter, own_tensors(self.filter, build_filter(self.primitive, description)))
+        return replace(self, filter=filter, primitive=primitive)
+
     def rebuilt(self, n_members: int | None = None, robust: RobustWeights | None = None) -> InteractionModel:
         """The same model with an ensemble of another size, or that weighs surprising values less.
 

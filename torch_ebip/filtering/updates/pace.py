@@ -15,11 +15,9 @@ import torch
 from torch import Tensor
 
 from torch_ebip.common.brief import brief
+from torch_ebip.common.draws import GOLDEN
 from torch_ebip.filtering.updates.part import Part
 from torch_ebip.filtering.updates.weighting import Seen
-
-GOLDEN = 0.6180339887498949
-"""Multiples of it, less their whole part, are evenly spread."""
 
 
 class Placement(NamedTuple):

@@ -44,8 +44,8 @@ FIRST, DUE, NEARLY = 0.9996, 0.9995, 0.0002
 SHORTEST, WIDEST = 1e-3, 0.3
 """s, between two values that have a velocity: over longer gaps it is none of the present. Bank and samples may be far
 apart in time: periods are `LONGEST` at most, and thinned recordings have less than that many samples."""
-SOME = 0.3
-"""Share of all phases at which interactions begin, of more than which members are far from each other at first."""
+APART = 0.05
+"""Deviation of the phases where interactions begin, beyond which members are far from each other at first."""
 HELD = 0.4, 0.8
 """Probability of standing still from which on the ensemble's clock is held, and from which on altogether: it would be
 behind if it were held a little all the time."""
@@ -124,7 +124,8 @@ class PhaseBank(Pace):
         self.register_buffer("transition", moves, persistent=False)
         begin = (likeness.phases == 0).to(pace) if begin is None else begin
         self.register_buffer("begin", owned(begin), persistent=False)
-        self.narrows = likeness.periodic or int((begin > 0).sum()) > SOME * len(begin)
+        spread = (begin * (likeness.phases - (begin * likeness.phases).sum()).square()).sum().sqrt()
+        self.narrows = likeness.periodic or float(spread) > APART
         self._settled: tuple[Tensor, int, Moves] | None = None
 
     @classmethod

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_ebip.common.brief import brief
-from torch_ebip.filtering.updates.pace import GOLDEN
+from torch_ebip.common.draws import GOLDEN
 
 
 class Waits(NamedTuple):
