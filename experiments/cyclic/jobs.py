@@ -27,7 +27,7 @@ METHODS = ("ebip_tuned", "tuned_once", "ebip_circle", "ebip_once")
 the factor that `learn` found best."""
 Answers = list[dict[str, Any]]
 """One of each method, recording and horizon: ``squared`` (m^2, mean over moments and DoFs of the partner),
-``inside`` (share within 95 % intervals), and ``phase`` (mean squared error on the circle), NaN without one."""
+``inside`` (share within 95 % intervals), and on a circle ``phase`` (mean squared error)."""
 
 
 @dataclass(frozen=True)
@@ -124,13 +124,13 @@ def _answered(
     said = forecast_recorded(filter, layout, values, AHEAD, job.seed)
     now = torch.arange(FIRST, len(values))
     answers: Answers = []
-    phase = math.nan
+    phase = {}
     if turned is not None:
         y = torch.where(partner, torch.nan, values)
         with torch.no_grad():
             followed = filter(y, generator=torch.Generator().manual_seed(job.seed)).phase
         off = apart(followed.double() - true - turned, True)[FIRST:]
-        phase = float(off.square().mean())
+        phase = {"phase": float(off.square().mean())}
     for k, ahead in enumerate(AHEAD):
         at = now[now + ahead * rate <= len(values) - 1]
         place = at + ahead * rate
@@ -148,7 +148,7 @@ def _answered(
                 "ahead": ahead,
                 "squared": float(error.square().mean()),
                 "inside": float((error.abs() <= Z95 * deviation).double().mean()),
-                "phase": phase,
+                **phase,
             }
         )
     return answers

@@ -39,8 +39,9 @@ def summarise(answers: Answers, seed: int) -> list[dict[str, Any]]:
             "unit": "m",
             "error": float(np.sqrt(squares.mean())),
             "inside": float(np.mean([answer["inside"] for answer in found])),
-            "phase_error": float(np.sqrt(np.mean([answer["phase"] for answer in found]))),
         }
+        if "phase" in found[0]:
+            row["phase_error"] = float(np.sqrt(np.mean([answer["phase"] for answer in found])))
         if method in PAIRS:
             others = np.array([answer["squared"] for answer in cells[beginning, PAIRS[method], ahead]])
             which = generator.integers(len(squares), size=(BOOTSTRAPS, len(squares)))
@@ -58,14 +59,14 @@ def lines_of(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[list[st
     for beginning in dict.fromkeys(row["beginning"] for row in rows):
         for method in METHODS:
             there = [found[beginning, method, ahead] for ahead in AHEAD]
-            phase = there[0]["phase_error"]
+            phase = there[0].get("phase_error")
             lines.append(
                 [
                     beginning,
                     method,
                     *(_cell(row) for row in there),
                     f"{np.mean([row['inside'] for row in there]):.1%}",
-                    "-" if np.isnan(phase) else f"{phase:.3f}",
+                    "-" if phase is None else f"{phase:.3f}",
                 ]
             )
     return ["begun", "method", *(f"{ahead:g} s ahead" for ahead in AHEAD), "inside", "phase"], lines

@@ -69,7 +69,7 @@ def waves(count: int, seed: int = 0, anywhere: bool = False, noise: float = 0.00
         own = usual + usual.abs() * (0.25 * manner + 0.03 * normal(2, 6, HARMONICS))
         angle = 2 * math.pi * order * phase.unsqueeze(-1)  # [T, H]
         path = torch.cos(angle) @ own[0].T + torch.sin(angle) @ own[1].T
-        where = middle + 0.02 * normal(6)
+        where = middle + 0.005 * normal(6)
         values = where + size.unsqueeze(-1) * path + noise * normal(n, 6)
         recordings.append(values.float())
         phases.append(phase)

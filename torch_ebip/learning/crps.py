@@ -22,7 +22,8 @@ def crps_of(held_out: HeldOut, filter: InteractionFilter, order: Tensor, scale: 
         held_out: the demonstrations, and what is asked of them.
         filter: over all DoFs.
         order: int64 [N], the interactions, of which the first decide; each set of sensors has its own.
-        scale: [P, D_targets], units in which errors of P horizons are measured; default: the targets' spread.
+        scale: [P, D_targets], units in which errors of the first P horizons are measured, and no others; default:
+            the targets' spread, of all.
     """
     task = held_out.task
     scale = task.objective.scale if scale is None else scale
@@ -32,9 +33,10 @@ def crps_of(held_out: HeldOut, filter: InteractionFilter, order: Tensor, scale: 
     for i, subset in enumerate(task.subsets.values()):
         some = order.roll(-i * each)[:each]
         for trial in held_out.trials(filter, some, subset, shares):
-            forecast, truth = trial.forecast(task.objective), trial.shown.truth
+            forecast, truth = trial.forecast(task.objective), trial.shown.truth[:, :, : len(scale)]
             measured = ~truth.isnan()
-            found = gaussian_crps(forecast.mean, forecast.variance, torch.where(measured, truth, 0))
+            mean, variance = forecast.mean[:, :, : len(scale)], forecast.variance[:, :, : len(scale)]
+            found = gaussian_crps(mean, variance, torch.where(measured, truth, 0))
             found = found / scale.expand_as(truth)
             total += float(found[measured].double().sum())
             count += float(measured.sum())

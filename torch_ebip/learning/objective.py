@@ -196,7 +196,8 @@ class ForecastObjective(Meaning):
 
     @without_autocast
     def spread_and_error(self, filter: InteractionFilter, trace: Trace, truth: Tensor, targets: Tensor) -> Tensor:
-        """[2]: root mean variance of the forecasts of phase 1 and root mean squared error of their mean.
+        """[2]: root mean variance of the forecasts of phase 1 and root mean squared error of their mean; on a circle,
+        which has no end, of the last horizon.
 
         Both in units of the targets' spread over the demonstrations; equal for a calibrated filter.
 
@@ -212,8 +213,8 @@ class ForecastObjective(Meaning):
         if trace.kept is None:
             raise ValueError("the trace kept no states to forecast from")
         end = torch.ones(1, dtype=truth.dtype, device=truth.device)
-        if filter.phase_model.periodic:  # nobody knows the phase of an end
-            forecast = filter.forecast(trace.kept, ahead=end / 0).select(targets)
+        if filter.phase_model.periodic and self.ahead is not None:  # nobody knows the phase of an end
+            forecast = filter.forecast(trace.kept, ahead=self.ahead[-1:]).select(targets)
         else:
             forecast = filter.forecast(trace.kept, end).select(targets)
         scale = self.scale if self.ahead is None else self.scale[-1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -88,7 +89,7 @@ def prepared(
     if why_not_periodic(known) is not None:
         return once
     circle = _fitted(known, asked, None, True, settings, ranks)
-    scale = once.task.objective.scale
+    scale = once.task.objective.scale[: len(circle.task.objective.scale)]  # of the horizons that both have
     errors = [course_error(each.held_out, scale) for each in (once, circle)]
     best = once if errors[0] <= errors[1] else circle
     best.course.update({"once": round(errors[0], 5), "circle": round(errors[1], 5)})
@@ -111,9 +112,12 @@ def _fitted(
     known, remarks = labelled(known, primitive, settings.seed, ranks)
     primitive.labels = known.labels
     there = reached(primitive, asked.ahead)
+    if periodic and len(there) > 1:
+        there = [a for a in there if not math.isinf(a)]  # where a circle is left nobody knows
     short = ", ".join(horizon_name(a) for a in asked.ahead if a not in there)
     if short:
-        remarks.append(f"not scored, because hardly any demonstration goes on for so long: {short}")
+        why = "nobody knows when these interactions end" if periodic else "hardly any demonstration goes on for so long"
+        remarks.append(f"not scored, because {why}: {short}")
     objective = objective_for(primitive, targets, asked.targets, there, asked.arm, asked.joints)
     masks = {name: layout.mask(names).to(targets.device) for name, names in asked.subsets.items()}
     task = Task(primitive, objective, targets, masks)
