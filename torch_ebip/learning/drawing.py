@@ -102,17 +102,20 @@ def drawn_of(
     told = torch.isin(said.interaction, scored.to(said.interaction.device))
     if said.counted is not None:
         drawn, deviation = drawn[:, said.counted], deviation[:, said.counted]
-        said = said._replace(wanted=said.wanted[:, said.counted], towards=said.towards[:, said.counted])
+        named = ((name, getattr(said, name)) for name in ("wanted", "towards", "usual"))
+        said = said._replace(**{name: part[:, said.counted] for name, part in named if part is not None})
     error = (drawn - said.wanted)[told]
     after = scores_of(tally(held_out, error * objective.scale, deviation[told] * objective.scale))
     each = gaussian_crps(error, deviation[told].square(), torch.zeros_like(error)).nanmean((0, 1, 3))
     after["crps"] = float(each.nanmean())
+    usual = torch.zeros_like(said.wanted[told]) if said.usual is None else said.usual[told]
+    wanted = said.wanted[told] - usual
     gains = [
         {
-            name: standard_errors(said.interaction[told], said.wanted[told, :, p : p + 1], other[told, :, p : p + 1])
+            name: standard_errors(said.interaction[told], wanted[:, :, p : p + 1], other[:, :, p : p + 1])
             for p, name in enumerate(names)
         }
-        for other in (drawn, said.towards)
+        for other in (drawn[told] - usual, said.towards[told] - usual)
     ]
     return Drawn(readout, shares, after, *gains)
 

@@ -66,7 +66,7 @@ def prepared(
     known: Demonstrations,
     asked: Asked,
     basis: StackedBasis | None,
-    periodic: bool | None,
+    periodic: bool | Sequence[str] | None,
     settings: TuningSettings,
     ranks: Ranks,
 ) -> Prepared:
@@ -76,13 +76,16 @@ def prepared(
         known: the demonstrations.
         asked: of them.
         basis: default: the best by BIC.
-        periodic: whether they repeat; default: as the basis says, or as their forecasts do, of interactions left out.
+        periodic: whether they repeat, or labels of all those that do; default: as the basis says, or as forecasts of
+            interactions left out do.
         settings: of ensembles and draws.
         ranks: the processes that share the work.
 
     Raises:
-        ValueError: periodic demonstrations that do not repeat, or hold less than a cycle; see `learn`.
+        ValueError: periodic demonstrations that do not repeat, or hold less than a cycle; labels that there are not,
+            or not all of them; see `learn`.
     """
+    periodic = periodic if periodic is None else _all_or_none(periodic, known)
     if basis is not None or periodic is not None:
         return _fitted(known, asked, basis, bool(periodic), settings, ranks)
     once = _fitted(known, asked, None, False, settings, ranks)
@@ -94,6 +97,25 @@ def prepared(
     best = once if errors[0] <= errors[1] else circle
     best.course.update({"once": round(errors[0], 5), "circle": round(errors[1], 5)})
     return best
+
+
+def _all_or_none(periodic: bool | Sequence[str], known: Demonstrations) -> bool:
+    """Whether all demonstrations repeat, by the labels of those that do."""
+    if isinstance(periodic, bool):
+        return periodic
+    named = [periodic] if isinstance(periodic, str) else list(periodic)
+    labels = list(dict.fromkeys(known.labels or ()))
+    strange = [name for name in named if name not in labels]
+    if strange:
+        there = ", ".join(labels) or "none"
+        raise ValueError(f"periodic names labels {', '.join(map(str, strange))}; the demonstrations have {there}")
+    others = [label for label in labels if label not in named]
+    if named and others:
+        raise ValueError(
+            f"{', '.join(named)} repeat and {', '.join(others)} do not: a phase cannot do both; learn a model of "
+            "each, of the demonstrations with these labels"
+        )
+    return bool(named)
 
 
 def _fitted(
@@ -112,11 +134,12 @@ def _fitted(
     known, remarks = labelled(known, primitive, settings.seed, ranks)
     primitive.labels = known.labels
     there = reached(primitive, asked.ahead)
-    if periodic and len(there) > 1:
-        there = [a for a in there if not math.isinf(a)]  # where a circle is left nobody knows
+    circle = primitive.periodic
+    if circle and len(there) > 1:
+        there = [a for a in there if not math.isinf(a)]
     short = ", ".join(horizon_name(a) for a in asked.ahead if a not in there)
     if short:
-        why = "nobody knows when these interactions end" if periodic else "hardly any demonstration goes on for so long"
+        why = "nobody knows when a wave ends" if circle else "hardly any demonstration goes on for so long"
         remarks.append(f"not scored, because {why}: {short}")
     objective = objective_for(primitive, targets, asked.targets, there, asked.arm, asked.joints)
     masks = {name: layout.mask(names).to(targets.device) for name, names in asked.subsets.items()}

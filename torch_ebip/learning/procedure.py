@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -63,7 +63,7 @@ class Procedure:
     analogues: bool
     expert: bool
     pace: bool
-    periodic: bool | None
+    periodic: bool | Sequence[str] | None
     ahead: tuple[float, ...]
     memories: int
     chances: dict[str, float]

@@ -49,7 +49,7 @@ def learn(
     analogues: bool = True,
     expert: bool = True,
     pace: bool = True,
-    periodic: bool | None = None,
+    periodic: bool | Sequence[str] | None = None,
     ahead: Sequence[float] = AHEAD,
     memories: int = 2,
     scan: int = 48,
@@ -87,8 +87,9 @@ def learn(
             `AnalogueReadout`.
         expert: whether a recurrent network may be heard beside analogues, where that is better; see `Expert`.
         pace: whether people may pause, start late or start over, where a `PhaseBank` makes that better.
-        periodic: whether they repeat, as waves do, so that their phase goes round a circle, see `CyclicPhase`;
-            default: where they seem to, and forecasts of interactions left out are better then.
+        periodic: whether they repeat, as waves do, so that their phase goes round a circle, see `CyclicPhase`; or the
+            labels of those that do, which must be all; default: where they seem to, and forecasts of interactions
+            left out are better then. Nobody knows when a wave ends: the end is then not scored.
         ahead: horizons that count alike, in s, increasing; the last is infinity, the end.
         memories: of the evidence: 2, a fast and a slow one, or the fast one alone.
         scan: how many interactions decide where the gradient starts.
@@ -102,8 +103,8 @@ def learn(
 
     Raises:
         ValueError: fewer than 3 demonstrations; names that there are not; a target that no demonstration moves; an
-            arm whose joints are not targets; periodic ones that do not repeat, or hold less than a cycle; a folder of
-            another learning; says which, and writes nothing.
+            arm whose joints are not targets; periodic ones that do not repeat, hold less than a cycle, or are only
+            some; a folder of another learning; says which, and writes nothing.
         KeyboardInterrupt: there was nothing to keep yet.
 
     Example:

@@ -14,7 +14,8 @@ from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.horizons import LEVELS, horizon_hats, level_hats
 from torch_ebip.interaction.present import Present
 from torch_ebip.interaction.readout import widths_of
-from torch_ebip.learning.held_out import HeldOut
+from torch_ebip.learning.held_out import HeldOut, Shown
+from torch_ebip.learning.references import paths_after
 
 
 class Said(NamedTuple):
@@ -31,6 +32,8 @@ class Said(NamedTuple):
         doubt: [R, K], how surprised the filter was, see `InteractionSurprise.doubt`; 0 if it never is.
         present: [R, K], what it knew of the present; None where it remembers nothing of late.
         counted: bool [K], the moments that scores are of, which are within the settings' horizons; None: all.
+        usual: [R, K, P, D], on a circle the training mean at the same time since the beginning, less ``mean``, which
+            is at the filter's phase; None: the two are taken for the same.
     """
 
     interaction: Tensor
@@ -44,6 +47,7 @@ class Said(NamedTuple):
     doubt: Tensor
     present: Present | None = None
     counted: Tensor | None = None
+    usual: Tensor | None = None
 
     def __repr__(self) -> str:
         return brief(self)
@@ -90,6 +94,8 @@ def what_it_says(
                     mean / scale,
                     trial.filter.doubted(state),
                     None if filter.recent is None else trial.filter.present(state),
+                    None,
+                    _usual(held_out, shown, mean),
                 )
             )
     gathered = held_out.ranks.gather([map_state(Tensor.cpu, part) for part in parts])
@@ -98,3 +104,15 @@ def what_it_says(
     found: Said = map_state(lambda *tensors: torch.cat(tensors).to(device), *together)
     low = held_out.settings.horizons[0]
     return found if shares is None else found._replace(counted=(shares >= low - 1e-6).to(device))
+
+
+def _usual(held_out: HeldOut, shown: Shown, mean: Tensor) -> Tensor | None:
+    """See `Said.usual`; the mean in units of the DoFs."""
+    task, ahead = held_out.task, held_out.task.objective.ahead
+    if not task.primitive.periodic or ahead is None:
+        return None
+    dt = held_out.settings.thinning / task.primitive.rate
+    time = (shown.steps * dt).to(mean).unsqueeze(-1) + ahead
+    among = shown.members[:, None, None, :].expand(*time.shape, -1)
+    paths = paths_after(task.primitive, time.unsqueeze(-1), among, task.targets)
+    return (paths.mean(-2) - mean) / task.objective.scale

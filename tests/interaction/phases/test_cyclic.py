@@ -315,3 +315,24 @@ def test_members_that_are_all_round_the_circle_are_brought_together() -> None:
         wide.append(float(torch.stack(off).mean().sqrt()))
     assert wide[0] < 0.08
     assert wide[1] > 3 * wide[0]
+
+
+def test_who_moves_as_nobody_did_does_not_send_members_round_and_round() -> None:
+    """Half a minute of nonsense, ten times as large as anything shown: phases stay where tables know them."""
+    primitive = small_circle()
+    noise = torch.Generator().manual_seed(0)
+    y = 10 * torch.randn(3, 900, 5, generator=noise).cumsum(1) / 10
+    for options in ({}, {"pace": PhaseBank.of(primitive)}, {"weigh": True, "inflation": 1.01}):
+        made = ebip(primitive, square_root=True, **options)
+        with torch.no_grad():
+            trace = made(torch.where(HUMAN, y, torch.nan), generator=noise, keep=torch.tensor([[300, 899]] * 3))
+            said = made.forecast(trace.kept, ahead=torch.tensor([0.5, math.inf]))
+        assert trace.state.mean.isfinite().all()
+        assert said.mean.isfinite().all()
+        moved = made.predict(trace.state, 1 / 30, noise).members[..., 0]
+        assert (moved - moved.mean(-1, keepdim=True)).abs().max() < 1
+    phases = torch.tensor([[0.2, 0.4, 7.3, -4.9], [0.9, 1.1, 1.3, 1.5]])
+    held = CyclicPhase().hold(phases)
+    torch.testing.assert_close(apart(held - phases, True), torch.zeros(2, 4), atol=1e-5, rtol=0)
+    assert (held - held.mean(-1, keepdim=True)).abs().max() < 0.75
+    torch.testing.assert_close(held[1].diff(), torch.full((3,), 0.2))

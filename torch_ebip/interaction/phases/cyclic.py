@@ -14,8 +14,9 @@ from torch_ebip.interaction.phases.constant_velocity import ConstantVelocityPhas
 class CyclicPhase(ConstantVelocityPhase):
     """Phase and phase velocity, in cycles and cycles a second; nothing ends at 1.
 
-    Members stay within one ensemble as they are, so that mean and spread of phases are those of real numbers; where
-    their mean has come once round, a whole cycle is taken off all of them: it lies within 0 and 1.
+    Within half a cycle of their mean members stay as they are, so that mean and spread of phases are those of real
+    numbers; from one that is further off whole cycles are taken, which mean nothing on a circle, and from all of them
+    where the mean has come once round: it lies within 0 and 1.
 
     Args:
         overrun: of no meaning on a circle; kept so that phases are made alike.
@@ -30,7 +31,9 @@ class CyclicPhase(ConstantVelocityPhase):
     periodic: ClassVar[bool] = True
 
     def hold(self, phase: Tensor) -> Tensor:
-        """Phases [..., E] of an ensemble without the whole cycles of their mean."""
+        """Phases [..., E] of an ensemble, each within half a cycle of their mean, and that within 0 and 1."""
+        middle = phase.detach().mean(-1, keepdim=True)
+        phase = phase - (phase.detach() - middle).round()
         return phase - phase.detach().mean(-1, keepdim=True).floor()
 
     def held_slope(self, phase: Tensor) -> Tensor:
