@@ -31,15 +31,17 @@ def main(arguments: list[str] | None = None) -> None:
     options = _parser().parse_args(arguments)
     began = time.monotonic()
     sets, known, tests, steps, scan = options.sets, options.demonstrations, options.tests, options.steps, 48
+    beginnings = BEGINNINGS
     if options.quick:
-        sets, known, tests, steps, scan = 1, min(known, 16), min(tests, 4), min(steps, 5), 6
+        sets, known, tests, steps, scan = 1, min(known, 14), min(tests, 4), min(steps, 3), 4
+        beginnings = BEGINNINGS[-1:]
     if sets < 1 or known < 3 or tests < 2:
         raise SystemExit("needs --sets of at least 1, --demonstrations of at least 3 and --tests of at least 2")
     first = Job("", options.seed, BEGINNINGS[0], known, tests, steps, scan, options.seed)
     run = RunFolder("cyclic", {**first.settings(), "sets": sets}, options.out, options.force, arguments)
     jobs = [
         replace(first, folder=str(run.path), movement=options.seed + s, beginning=beginning)
-        for beginning in BEGINNINGS
+        for beginning in beginnings
         for s in range(sets)
     ]
     for job in jobs:

@@ -34,13 +34,12 @@ def test_the_command_at_a_small_size(tmp_path: Path, capsys: pytest.CaptureFixtu
     main(run)
     results = json.loads((tmp_path / "run" / "results.json").read_text())
     rows = {(row["beginning"], row["method"], row["ahead"]): row for row in results["rows"]}
-    assert len(rows) == len(BEGINNINGS) * len(METHODS) * len(AHEAD)
+    assert len(rows) == len(METHODS) * len(AHEAD)
     for row in rows.values():
         assert 0 < row["error"] < 0.5
         assert 0 < row["inside"] <= 1
-    for beginning in BEGINNINGS:
-        assert rows[beginning, "ebip_tuned", 0.1]["ratio"] < 1  # the circle was found, and pays, of 16 recordings
-        assert rows[beginning, "ebip_tuned", 0.1]["phase_error"] < 0.15
+    assert rows[BEGINNINGS[-1], "ebip_tuned", 0.1]["ratio"] < 1  # the circle was found, and pays, of 14 recordings
+    assert rows[BEGINNINGS[-1], "ebip_tuned", 0.1]["phase_error"] < 0.15
     assert (tmp_path / "run" / "cyclic.png").stat().st_size > 20_000
     assert "ebip_circle" in (tmp_path / "run" / "results.md").read_text()
     assert "anywhere" in capsys.readouterr().out

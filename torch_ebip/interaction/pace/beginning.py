@@ -20,3 +20,9 @@ def begin_of(first: Tensor, phases: Tensor, periodic: bool) -> Tensor:
         index = cell.long() % P if periodic else cell.long().clamp(max=P - 1)
         begin = begin.index_add(0, index, share)
     return begin / len(first)
+
+
+def spread_of(begin: Tensor, phases: Tensor) -> float:
+    """Deviation of phases [P] with probabilities ``begin`` [P]."""
+    middle = (begin * phases).sum()
+    return float((begin * (phases - middle).square()).sum().sqrt())

@@ -20,7 +20,7 @@ from torch_ebip.filtering.model import StateSpace
 from torch_ebip.filtering.protocols import View
 from torch_ebip.filtering.updates.pace import Pace, Placement
 from torch_ebip.filtering.updates.weighting import Seen
-from torch_ebip.interaction.pace.beginning import begin_of
+from torch_ebip.interaction.pace.beginning import begin_of, spread_of
 from torch_ebip.interaction.pace.leading import belief_of, placement_of
 from torch_ebip.interaction.pace.likeness import Likeness, likeness_of
 from torch_ebip.interaction.pace.moves import Moves, moves_of, transition_of
@@ -124,8 +124,7 @@ class PhaseBank(Pace):
         self.register_buffer("transition", moves, persistent=False)
         begin = (likeness.phases == 0).to(pace) if begin is None else begin
         self.register_buffer("begin", owned(begin), persistent=False)
-        spread = (begin * (likeness.phases - (begin * likeness.phases).sum()).square()).sum().sqrt()
-        self.narrows = likeness.periodic or float(spread) > APART
+        self.narrows = likeness.periodic or spread_of(begin, likeness.phases) > APART
         self._settled: tuple[Tensor, int, Moves] | None = None
 
     @classmethod
