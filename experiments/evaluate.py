@@ -113,7 +113,9 @@ class FilterMethod:
         assert trace.kept is not None
         forecast = part.forecast(trace.kept, ahead=list(ahead)).select(dofs[used].to(device))
         tensors = (value.to(y) if isinstance(value, Tensor) else value for value in forecast)
-        return Answer(Forecast(*tensors), part.phase(trace.kept).to(y))
+        phase = part.phase(trace.kept).to(y)
+        # On a circle it is not the share of the interaction that is over.
+        return Answer(Forecast(*tensors), phase * torch.nan if part.phase_model.periodic else phase)
 
 
 class MeanMethod:

@@ -100,3 +100,26 @@ def test_a_primitive_knows_where_its_demonstrations_are() -> None:
     with pytest.raises(ValueError, match="need a periodic basis"):
         InteractionPrimitive.fit(made.recordings, StackedBasis([BSplineBasis(6)] * 5), periodic=True)
     assert InteractionPrimitive.fit(made.recordings, StackedBasis([PeriodicBSplineBasis(6)] * 5)).periodic
+
+
+def test_phases_of_other_recordings_mean_the_same() -> None:
+    """Recordings that begin anywhere, learned from in two parts: which phase is 0 was found in each anew."""
+    made = waving(24, seed=2, anywhere=True)
+    primitive = InteractionPrimitive.fit(made.recordings.subset(range(14)), periodic=True)
+    later = made.recordings.subset(range(14, 24))
+    true = torch.stack([phase[0] for phase in made.phases])
+    for several in (primitive.extend(later), primitive.extend(later.subset([0]))):
+        off = several.first_phase.double() - true[: len(several)]
+        turned = torch.polar(torch.ones_like(off), 2 * math.pi * off)
+        assert turned.mean().abs() > 0.97
+        assert several.first_phase.abs().max() <= 0.5
+        assert torch.angle(turned[14:].mean() / turned[:14].mean()).abs() / (2 * math.pi) < 0.02
+    alone = InteractionPrimitive.fit(later, primitive.basis)
+    moved = InteractionPrimitive.fit(later, primitive.basis, turned=0.25)
+    phase = torch.linspace(0, 1, 7)
+    torch.testing.assert_close(
+        moved.basis.project_paths(phase + 0.25, moved.weights),
+        alone.basis.project_paths(phase, alone.weights),
+        atol=1e-4,
+        rtol=1e-4,
+    )

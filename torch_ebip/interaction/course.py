@@ -8,6 +8,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torch_ebip.interaction.basis.stacked import StackedBasis
+
+TURNS = 360
+"""That are tried, evenly round the circle."""
+
 
 def within(phase: Tensor, periodic: bool) -> Tensor:
     """Phases [...] as they are looked up in tables from 0 to 1: held at both ends, or without whole cycles."""
@@ -45,3 +50,16 @@ def circular_of(cosine: Tensor, sine: Tensor) -> tuple[Tensor, Tensor]:
     mean = torch.atan2(sine, cosine) / turn
     length = torch.hypot(cosine, sine).clamp(1e-6, 1 - 1e-9)
     return mean - mean.detach().floor(), (-2 * length.log()).sqrt() / turn
+
+
+def turn_between(basis: StackedBasis, these: Tensor, others: Tensor) -> float:
+    """Cycles by which phases of some sets of weights [N, n_weights] must be further on to mean what those of others,
+    [M, n_weights], do: their mean paths are then most alike, every DoF in its own deviation."""
+    phase = torch.arange(TURNS, dtype=these.dtype, device=these.device) / TURNS
+    paths = [basis.project_paths(phase, weights.mean(0)).double() for weights in (these, others)]
+    apart = [path - path.mean(0) for path in paths]
+    size = [path.square().mean(0).sqrt() for path in apart]
+    scale = size[0] * size[1]
+    products = [torch.fft.rfft(path, dim=0) for path in apart]
+    alike = torch.fft.irfft(products[1] * products[0].conj(), n=TURNS, dim=0)
+    return int((alike / torch.where(scale > 0, scale, torch.inf)).sum(-1).argmax()) / TURNS

@@ -12,16 +12,10 @@ from torch_ebip.common.ambient import in_own_modes, owned
 from torch_ebip.common.arguments import as_indices, as_values
 from torch_ebip.common.draws import GOLDEN
 from torch_ebip.common.meaning import Meaning
-from torch_ebip.interaction.basis.regression import (
-    Samples,
-    correlation_time,
-    mean_squared_residual,
-    measured_variance,
-    regress,
-    samples_of,
-)
+from torch_ebip.interaction.basis.regression import measured_variance, regress_all, samples_of
 from torch_ebip.interaction.basis.selection import select_basis
 from torch_ebip.interaction.basis.stacked import StackedBasis
+from torch_ebip.interaction.course import turn_between
 from torch_ebip.recordings.demonstrations import Demonstrations
 from torch_ebip.recordings.layout import Layout
 from torch_ebip.recordings.repeats import longest_repeats
@@ -98,7 +92,12 @@ class InteractionPrimitive(Meaning):
     @classmethod
     @in_own_modes
     def fit(
-        cls, demonstrations: Demonstrations, basis: StackedBasis | None = None, *, periodic: bool = False
+        cls,
+        demonstrations: Demonstrations,
+        basis: StackedBasis | None = None,
+        *,
+        periodic: bool = False,
+        turned: float = 0.0,
     ) -> InteractionPrimitive:
         """Batched least squares (float64) of all demonstrations and DoFs, tolerant of missing samples.
 
@@ -107,6 +106,7 @@ class InteractionPrimitive(Meaning):
             basis: default: `select_basis(demonstrations)`; a periodic one for interactions that repeat, whose cycles
                 are then looked for.
             periodic: whether they repeat; default: as the basis says.
+            turned: cycles by which phases on a circle are further on than they are found to be.
 
         Returns:
             A primitive in the dtype and on the device of the demonstrations.
@@ -133,18 +133,11 @@ class InteractionPrimitive(Meaning):
                     "of the basis"
                 )
         samples = samples_of(demonstrations, basis.periodic)
+        if basis.periodic:
+            first = samples.phase[:, :1] + turned
+            samples = samples._replace(phase=samples.phase + turned - first.round())
         resolution = torch.finfo(demonstrations[0].dtype).eps
-        weights = samples.values.new_empty(len(demonstrations), basis.n_weights)
-        variance = samples.values.new_empty(layout.n_dofs)
-        correlation = samples.values.new_empty(layout.n_dofs)
-        for unique in dict.fromkeys(basis.bases):
-            dofs = [d for d, other in enumerate(basis.bases) if other == unique]
-            part = Samples(samples.phase, *(tensor[..., dofs] for tensor in samples[1:]))
-            fit = regress(unique, part)
-            for i, dof in enumerate(dofs):
-                weights[:, basis.weight_slices[dof]] = fit.weights[:, i]
-            variance[dofs] = mean_squared_residual(fit, part).nanmean(0)
-            correlation[dofs] = correlation_time(fit, part)
+        weights, variance, correlation = regress_all(basis, samples)
         spread = measured_variance(samples, resolution)
         # A DoF that is fitted exactly would have R = 0, and with it a singular innovation covariance. What floor is
         # small depends on its unit, which its spread tells, its size if it never moves, and nothing if it is 0.
@@ -232,9 +225,7 @@ class InteractionPrimitive(Meaning):
         Raises:
             ValueError: see `fit`.
         """
-        # A primitive is of two at least: of one, the second is the same again.
-        several = demonstrations if len(demonstrations) > 1 else demonstrations.subset([0, 0])
-        more = InteractionPrimitive.fit(several, self.basis)
+        more = self.like(demonstrations)
         both = self.labels is not None and demonstrations.labels is not None
         return self._with(
             labels=(*(self.labels or ()), *(demonstrations.labels or ())) if both else None,
@@ -242,6 +233,18 @@ class InteractionPrimitive(Meaning):
             **{
                 name: torch.cat([getattr(self, name), getattr(more, name)[: len(demonstrations)]]) for name in OF_EACH
             },
+        )
+
+    def like(self, demonstrations: Demonstrations) -> InteractionPrimitive:
+        """Of other demonstrations on the same basis, whose phases mean the same; see `extend` and `fit`."""
+        # A primitive is of two at least: of one, the second is the same again.
+        several = demonstrations if len(demonstrations) > 1 else demonstrations.subset([0, 0])
+        more = InteractionPrimitive.fit(several, self.basis)
+        if not self.periodic:
+            return more
+        # Where a cycle begins is found anew in every set.
+        return InteractionPrimitive.fit(
+            several, self.basis, turned=turn_between(self.basis, more.weights, self.weights)
         )
 
     def starting_at(self, phases: Sequence[float] | Tensor) -> InteractionPrimitive:

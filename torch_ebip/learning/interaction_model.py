@@ -237,8 +237,7 @@ class InteractionModel:
         new = self.prepare(demonstrations).to(dtype=mine.weights.dtype, device=mine.weights.device)
         if self.labels is not None and new.labels is None and self.report.get("groups"):
             # Nobody named the groups of the first ones either.
-            other = InteractionPrimitive.fit(new if len(new) > 1 else new.subset([0, 0]), mine.basis)
-            new = new.labelled(groups_of(mine, self.labels, other)[: len(new)])
+            new = new.labelled(groups_of(mine, self.labels, mine.like(new))[: len(new)])
         if (new.labels is None) != (self.labels is None):
             raise ValueError("labels: the model and the recordings must both have them, or neither")
         primitive = mine.extend(new)

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch_ebip.common.ambient import without_autocast
 from torch_ebip.common.brief import brief
 from torch_ebip.interaction.basis.base import Basis
+from torch_ebip.interaction.basis.stacked import StackedBasis
 from torch_ebip.interaction.cycles import cycles_of
 from torch_ebip.recordings.demonstrations import Demonstrations
 
@@ -116,6 +117,23 @@ def regress(basis: Basis, samples: Samples) -> Fit:
         weights = torch.where(absent.unsqueeze(-1), (weights * share.unsqueeze(-1)).sum(0), weights)
     residuals = samples.values - features @ weights.transpose(-1, -2)
     return Fit(weights, torch.where(samples.observed, residuals, 0))
+
+
+def regress_all(basis: StackedBasis, samples: Samples) -> tuple[Tensor, Tensor, Tensor]:
+    """Weights [N, n_weights] of all DoFs, each on its own basis; and of their residuals the mean square, [D], squared
+    units, over demonstrations alike, and the `correlation_time`, [D]."""
+    weights = samples.values.new_empty(len(samples.values), basis.n_weights)
+    variance = samples.values.new_empty(basis.n_dofs)
+    correlation = samples.values.new_empty(basis.n_dofs)
+    for unique in dict.fromkeys(basis.bases):
+        dofs = [d for d, other in enumerate(basis.bases) if other == unique]
+        part = Samples(samples.phase, *(tensor[..., dofs] for tensor in samples[1:]))
+        fit = regress(unique, part)
+        for i, dof in enumerate(dofs):
+            weights[:, basis.weight_slices[dof]] = fit.weights[:, i]
+        variance[dofs] = mean_squared_residual(fit, part).nanmean(0)
+        correlation[dofs] = correlation_time(fit, part)
+    return weights, variance, correlation
 
 
 def mean_squared_residual(fit: Fit, samples: Samples) -> Tensor:
