@@ -86,7 +86,8 @@ def learn(
         analogues: whether they may be put together with those of analogues, where that is better; see
             `AnalogueReadout`.
         expert: whether a recurrent network may be heard beside analogues, where that is better; see `Expert`.
-        pace: whether people may pause, start late or start over, where a `PhaseBank` makes that better.
+        pace: whether people may pause, start late or start over, where a `PhaseBank` makes that better; of those who
+            repeat themselves a bank follows the phase in any case, unless this finds that it is better without.
         periodic: whether they repeat, as waves do, so that their phase goes round a circle, see `CyclicPhase`; or the
             labels of those that do, which must be all; default: where they seem to, and forecasts of interactions
             left out are better then. Nobody knows when a wave ends: the end is then not scored.

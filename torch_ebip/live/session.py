@@ -175,7 +175,7 @@ class InteractionSession:
                 self._log.write(["forecast", now, asked, mean.tolist()])
             if not several:
                 mean, deviation = mean[0], deviation[0]
-            phase = min(max(timeline.phase_now()[0], 0.0), 1.0)
+            phase = timeline.place()
             now, stale = timeline.now, tuple(self.sensors[i] for i in timeline.stale())
             return SessionForecast(
                 now, phase, left, self.dofs, mean, deviation, stale, tuple(horizons),

@@ -165,14 +165,19 @@ class Timeline:
         gone = since if waits is None else float(waits.gone(self._like.new_tensor([since])))
         return phase + velocity * gone, velocity
 
+    def place(self) -> float:
+        """The phase within 0 and 1."""
+        phase, _ = self.phase_now()
+        return phase % 1.0 if self._periodic else min(max(phase, 0.0), 1.0)
+
     def time_to_end(self) -> float:
         """Seconds until phase 1, of who stands still until they go on, too; infinite where there is no end."""
-        phase, velocity = self.phase_now()
+        _, velocity = self.phase_now()
         if self._periodic or velocity <= 0:
             return math.inf
         waits = self._engine.waits()
         rest = 0.0 if waits is None else float(waits.rest)
-        return (1 - min(max(phase, 0.0), 1.0)) / velocity + rest
+        return (1 - self.place()) / velocity + rest
 
     def forecast(self, horizons: Sequence[float]) -> Forecast:
         """Of the controlled DoFs so many seconds ahead of the present; infinity: the end.

@@ -252,7 +252,10 @@ def test_a_session_on_a_circle_has_no_end() -> None:
         session.push("gaze", row[2:3], t / 30)
     expected = session.forecast()
     assert expected.time_to_end == math.inf
-    assert 0 <= expected.phase <= 1
+    ahead = [session.forecast(now=89 / 30 + wait).phase for wait in (0.0, 0.2, 0.4, 0.6)]
+    assert all(0 <= phase < 1 for phase in ahead)
+    steps = apart(torch.tensor(ahead).diff(), True)
+    torch.testing.assert_close(steps, steps[:1].expand(3), atol=0.02, rtol=0)
     soon = session.forecast([0.0, 0.1, 5.0])
     assert soon.deviation.shape == (3, 2)
     assert np.isfinite(soon.mean).all()
