@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch_ebip
 from experiments.data import load
@@ -30,6 +31,7 @@ def learn(
     steps: int,
     progress: Callable[[Progress], None] | None,
     scan: int = 48,
+    **options: Any,
 ) -> None:
     """Learn a model of 80 members for all sensors together, of all demonstrations; what is finished is kept.
 
@@ -40,6 +42,7 @@ def learn(
         steps: gradient steps at most.
         progress: called with a `Progress`.
         scan: interactions that decide where tuning starts.
+        options: further ones of `torch_ebip.learn`.
     """
     known, task = load(None, demonstrations, seed)
     assert task.arm is not None
@@ -58,6 +61,7 @@ def learn(
         joints=task.arm[1],
         scan=scan,
         horizons=HORIZONS,
+        **options,
     )
     if model.report["interrupted"]:
         raise KeyboardInterrupt

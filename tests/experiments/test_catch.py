@@ -267,11 +267,12 @@ def test_a_filter_of_other_demonstrations_is_refused(learned: Path, tmp_path: Pa
 
 def test_learning_leaves_a_tuned_filter_of_eighty(tmp_path: Path) -> None:
     stages: list[str] = []
-    learn(tmp_path, 110, 0, 1, lambda progress: stages.append(progress.stage), scan=4)
+    quick = {"scan": 4, "pace": False, "expert": False, "analogues": False}
+    learn(tmp_path, 90, 0, 1, lambda progress: stages.append(progress.stage), **quick)
     assert "gradient" in stages
     report = json.loads((tmp_path / "report.json").read_text())
-    filter = filters(tmp_path, know(110, 0), report["factor"])["ebip_tuned"]()
+    filter = filters(tmp_path, know(90, 0), report["factor"])["ebip_tuned"]()
     assert filter.n_members == MEMBERS
     told = len(stages)
-    learn(tmp_path, 110, 0, 1, lambda progress: stages.append(progress.stage), scan=4)  # nothing left to do
+    learn(tmp_path, 90, 0, 1, lambda progress: stages.append(progress.stage), **quick)  # nothing left to do
     assert len(stages) == told

@@ -62,7 +62,7 @@ def test_scores_are_the_formulas() -> None:
 
 
 def test_the_command_finds_who_lies(tmp_path, capsys: pytest.CaptureFixture[str]) -> None:
-    main(["--quick", "--tests", "30", "--faulty", "12", "--steps", "0", "--out", str(tmp_path / "run")])
+    main(["--quick", "--tests", "20", "--faulty", "8", "--steps", "0", "--out", str(tmp_path / "run")])
     results = json.loads((tmp_path / "run" / "results.json").read_text())
     found = results["detection"]["hand off by 0.5"]
     assert found["rate"]["hand"] == 1.0
@@ -83,6 +83,6 @@ def test_the_command_finds_who_lies(tmp_path, capsys: pytest.CaptureFixture[str]
     assert (tmp_path / "run" / "surprise.png").stat().st_size > 10_000
     assert "AUC by half" in capsys.readouterr().out
     with pytest.raises(SystemExit, match="finished run"):
-        main(["--quick", "--tests", "30", "--faulty", "12", "--steps", "0", "--out", str(tmp_path / "run")])
+        main(["--quick", "--tests", "20", "--faulty", "8", "--steps", "0", "--out", str(tmp_path / "run")])
     with pytest.raises(SystemExit, match="--sensor must be one of several DoFs"):
         main(["--quick", "--sensor", "arm", "--out", str(tmp_path / "other")])

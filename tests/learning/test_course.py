@@ -19,7 +19,7 @@ from torch_ebip.learning.settings import settings_for
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> InteractionModel:
     folder = tmp_path_factory.mktemp("waves")
-    made = learn(waving(26).recordings, steps=5, scan=6, pace=False, folder=folder, progress=lambda _: None)
+    made = learn(waving(22).recordings, steps=4, scan=6, pace=False, folder=folder, progress=lambda _: None)
     again = load_model(folder / "model.safetensors")
     values = waving(2, seed=5).recordings[0]
     assert torch.equal(again.forecast(values, [0.2]).mean, made.forecast(values, [0.2]).mean)
