@@ -34,18 +34,12 @@ def ends(phase: Tensor, end: Tensor, periodic: bool) -> Tensor:
     return torch.where(end, even, phase)
 
 
-def circular(shares: Tensor, phases: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and deviation [...] on a circle of probabilities [..., P] of phases [P], in cycles.
+def circular_of(cosine: Tensor, sine: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean in [0, 1) and deviation, [...] each, in cycles, by the mean ``cosine`` and ``sine`` [...] of phases.
 
     The deviation is that of the wrapped normal distribution with as long a mean vector (Mardia & Jupp 2000, section
     2.3).
     """
-    angle = 2 * torch.pi * phases
-    return circular_of((shares * angle.cos()).sum(-1), (shares * angle.sin()).sum(-1))
-
-
-def circular_of(cosine: Tensor, sine: Tensor) -> tuple[Tensor, Tensor]:
-    """The same of the mean ``cosine`` and ``sine`` [...] of phases: mean in [0, 1), deviation, in cycles."""
     turn = 2 * torch.pi
     mean = torch.atan2(sine, cosine) / turn
     length = torch.hypot(cosine, sine).clamp(1e-6, 1 - 1e-9)

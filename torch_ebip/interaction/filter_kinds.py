@@ -17,6 +17,9 @@ from torch_ebip.interaction.course import ends
 from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.forecast import Forecast, as_phases
 
+PLACES = 40
+"""On a circle, over which the end may be anywhere."""
+
 
 class InteractionMemberFilter(InteractionFilter, MemberFilter):
     """Forecasts of members."""
@@ -98,9 +101,23 @@ class InteractionExtendedFilter(InteractionFilter, ExtendedFilter):
         now, velocity = self.phase(state).unsqueeze(-1), self.phase_velocity(state).unsqueeze(-1)
         phase = now + velocity.clamp(min=0) * torch.where(ahead.isinf(), 0, ahead)
         if self.phase_model.periodic:
-            return self._forecast(state, phase)
+            return self._round(state, phase, ahead.isinf())
         phase = torch.where(ahead.isinf(), 1, phase).clamp(max=1)
         return self._forecast(state, phase)
+
+    def _round(self, state: GaussianState, phase: Tensor, end: Tensor) -> Forecast:
+        """On a circle: at phases [..., P], and where the end is asked for, bool [P], of all phases together."""
+        said = self._forecast(state, phase)
+        if not bool(end.any()):
+            return said
+        places = (torch.arange(PLACES, dtype=phase.dtype, device=phase.device) + 0.5) / PLACES
+        whole = self._forecast(state, places)
+        mean = whole.mean.mean(-2, keepdim=True)
+        variance = (whole.variance + (whole.mean - mean).square()).mean(-2, keepdim=True)
+        asked = end.unsqueeze(-1)
+        return said._replace(
+            mean=torch.where(asked, mean, said.mean), variance=torch.where(asked, variance, said.variance)
+        )
 
     def _forecast(self, state: GaussianState, phase: Tensor) -> Forecast:
         """h(phi, mu) and Phi(phi) Sigma_ww Phi(phi)' at phases [..., P] to come."""

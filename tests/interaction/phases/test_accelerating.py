@@ -8,6 +8,7 @@ import torch
 
 from tests.conftest import interactions, small_primitive
 from tests.filtering.contract import FilterContract
+from tests.interaction.phases.textbook import updated
 from tests.interaction.test_ebip import silent
 from torch_ebip import (
     AcceleratingPhase,
@@ -86,12 +87,7 @@ def test_the_extended_filter_is_that_of_the_textbook() -> None:
     for t in range(12):
         if t:
             mean, covariance = G @ mean, G @ covariance @ G.T + Q
-        step = 1e-6
-        H = np.stack([(h(mean + step * e) - h(mean - step * e)) / (2 * step) for e in np.eye(n)], -1)
-        S = H @ covariance @ H.T + R
-        K = covariance @ H.T @ np.linalg.inv(S)
-        mean = mean + K @ (y[t, :3] - h(mean))
-        covariance = covariance - K @ S @ K.T
+        mean, covariance = updated(mean, covariance, y[t, :3], R, h)
     trace = made(torch.tensor(y), HUMAN.expand(12, 5))
     np.testing.assert_allclose(trace.state.mean.detach().numpy(), mean, atol=1e-5)
     np.testing.assert_allclose(trace.state.covariance.detach().numpy(), covariance, atol=1e-5)

@@ -12,6 +12,7 @@ import torch
 from tests.conftest import small_primitive
 from tests.filtering.contract import FilterContract
 from tests.interaction.cyclic import HUMAN, small_circle, waving
+from tests.interaction.phases.textbook import updated
 from tests.interaction.test_ebip import silent
 from torch_ebip import (
     AcceleratingPhase,
@@ -30,7 +31,7 @@ from torch_ebip import (
     load_model,
     particle_filter,
 )
-from torch_ebip.interaction.course import apart, circular, within
+from torch_ebip.interaction.course import apart, circular_of, within
 from torch_ebip.interaction.table import DemonstrationTable
 
 
@@ -109,12 +110,7 @@ def test_the_extended_filter_is_that_of_the_textbook() -> None:
     for t in range(70):
         if t:
             mean, covariance = G @ mean, G @ covariance @ G.T + Q
-        step = 1e-6
-        H = np.stack([(h(mean + step * e) - h(mean - step * e)) / (2 * step) for e in np.eye(n)], -1)
-        S = H @ covariance @ H.T + R
-        K = covariance @ H.T @ np.linalg.inv(S)
-        mean = mean + K @ (y[t, :3] - h(mean))
-        covariance = covariance - K @ S @ K.T
+        mean, covariance = updated(mean, covariance, y[t, :3], R, h)
     trace = made(torch.tensor(y), HUMAN.expand(70, 5))
     assert mean[0] > 1.2
     assert trace.phase.max() < 1
@@ -284,6 +280,11 @@ def test_tables_and_analogues_go_round() -> None:
     assert Analogues.of(primitive).table.periodic
 
 
+def circular(shares: torch.Tensor, phases: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    angle = 2 * math.pi * phases
+    return circular_of((shares * angle.cos()).sum(-1), (shares * angle.sin()).sum(-1))
+
+
 def test_means_and_differences_on_a_circle() -> None:
     phases = torch.arange(10).double() / 10
     mean, deviation = circular(torch.eye(10).double(), phases)
@@ -339,3 +340,15 @@ def test_who_moves_as_nobody_did_does_not_send_members_round_and_round() -> None
     torch.testing.assert_close(apart(held - phases, True), torch.zeros(2, 4), atol=1e-5, rtol=0)
     assert (held - held.mean(-1, keepdim=True)).abs().max() < 0.75
     torch.testing.assert_close(held[1].diff(), torch.full((3,), 0.2))
+
+
+def test_the_extended_filter_knows_no_end_either() -> None:
+    primitive = small_circle(torch.float64)
+    made = bip(primitive)
+    with torch.no_grad():
+        said = made.forecast(made.initial_state(), ahead=torch.tensor([0.0, math.inf]).double())
+    paths = primitive.basis.project_paths(torch.arange(240).double() / 240, primitive.weights)
+    torch.testing.assert_close(said.mean[1], paths.mean((0, 1)), atol=1e-6, rtol=0)
+    torch.testing.assert_close(said.variance[1].sqrt(), paths.flatten(0, 1).std(0), rtol=0.05, atol=0)
+    at_once = made.forecast(made.initial_state(), torch.zeros(1).double())
+    torch.testing.assert_close(said.mean[0], at_once.mean[0], atol=0.05, rtol=0)

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from tests.conftest import interactions, small_primitive
 from tests.filtering.contract import FilterContract
+from tests.interaction.phases.textbook import updated
 from tests.interaction.test_ebip import silent
 from torch_ebip import (
     DriftingPhase,
@@ -50,7 +51,7 @@ def test_the_extended_filter_is_that_of_the_textbook() -> None:
     y = interactions(2, seed=9, dtype=torch.float64)[1][:12].numpy()
     state = made.initial_state()
     mean, covariance = state.mean.numpy(), state.covariance.numpy()
-    n, dt = len(mean), made.dt
+    dt = made.dt
     rate = float(primitive.phase_velocity.mean())
     q = float(made.model.process_noise.phase.strength.value.detach()) ** 2 * dt
     R = np.diag(made.model.measurement_noise().detach().numpy()[:3] ** 2)
@@ -65,12 +66,7 @@ def test_the_extended_filter_is_that_of_the_textbook() -> None:
             mean[0] += rate * dt
             covariance = covariance.copy()
             covariance[0, 0] += q
-        step = 1e-6
-        H = np.stack([(h(mean + step * e) - h(mean - step * e)) / (2 * step) for e in np.eye(n)], -1)
-        S = H @ covariance @ H.T + R
-        K = covariance @ H.T @ np.linalg.inv(S)
-        mean = mean + K @ (y[t, :3] - h(mean))
-        covariance = covariance - K @ S @ K.T
+        mean, covariance = updated(mean, covariance, y[t, :3], R, h)
     trace = made(torch.tensor(y), HUMAN.expand(12, 5))
     np.testing.assert_allclose(trace.state.mean.detach().numpy(), mean, atol=1e-5)
     assert trace.states.shape == (12, 1)
