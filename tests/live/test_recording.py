@@ -21,27 +21,32 @@ from torch_ebip import InteractionSession, ebip, replay
 from torch_ebip.live.log import fingerprint
 
 
-def record(path: Path, name: str = "ebip with options") -> InteractionSession:
+def record(path: Path, name: str = "ebip with options") -> None:
     """An interaction with late, missing, broken and malformed samples, recorded."""
-    with live(name, seed=11, record=path) as session:
-        for k, (sensor, value, time) in enumerate(samples()):
-            session.push(sensor, value, time - (0.1 if k % 7 == 0 else 0.0))
-            if k % 5 == 0:
-                session.push(sensor, [math.nan, math.inf][: len(value)], time)
-                session.push(sensor, {"not": "numbers"}, time)
-                session.push(sensor, value, "yesterday")
-            if k % 3 == 0:
-                session.forecast([0.1, 0.3], time)
-            if k % 4 == 0:
-                session.advance(time)
-        session.forecast(0.1)
-        session.forecast()
+    recording(path, name).close()
+
+
+def recording(path: Path, name: str = "ebip with options") -> InteractionSession:
+    """The same, still open."""
+    session = live(name, seed=11, record=path)
+    for k, (sensor, value, moment) in enumerate(samples()):
+        session.push(sensor, value, moment - (0.1 if k % 7 == 0 else 0.0))
+        if k % 5 == 0:
+            session.push(sensor, [math.nan, math.inf][: len(value)], moment)
+            session.push(sensor, {"not": "numbers"}, moment)
+            session.push(sensor, value, "yesterday")
+        if k % 3 == 0:
+            session.forecast([0.1, 0.3], moment)
+        if k % 4 == 0:
+            session.advance(moment)
+    session.forecast(0.1)
+    session.forecast()
     return session
 
 
 @pytest.mark.parametrize("name", filters())
 def test_a_recording_replays_to_the_bit(name: str, tmp_path: Path) -> None:
-    session = record(tmp_path / "log.jsonl", name)
+    session = recording(tmp_path / "log.jsonl", name)
     again = replay(tmp_path / "log.jsonl", filters()[name], primitive())
     assert len(again.forecasts) > 15
     assert again.identical
@@ -202,10 +207,12 @@ def test_a_full_disk_ends_the_recording_and_not_the_session(tmp_path: Path) -> N
     stream = samples()
     for sample in stream[:20]:
         session.push(*sample)
+    session.report()
     written = path.read_text()
     with full_disk(path.stat().st_size):
+        session.push(*stream[20])
         with pytest.warns(UserWarning, match=r"log\.jsonl: (the recording ends here|the last lines may be missing)"):
-            session.push(*stream[20])
+            session.report()
         session.push(*stream[21])
         assert bool(session.forecast(0.1).mean.isfinite().all())
     session.push(*stream[22])

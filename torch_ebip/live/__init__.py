@@ -2,8 +2,8 @@
 
 from torch_ebip.live.filter import LiveFilter, LiveSnapshot
 from torch_ebip.live.forecast import SessionForecast
-from torch_ebip.live.intake import SensorReport
 from torch_ebip.live.replaying import Replay, replay
+from torch_ebip.live.report import SensorReport, SessionReport
 from torch_ebip.live.session import InteractionSession
 from torch_ebip.live.settings import SessionSettings
 
@@ -14,6 +14,7 @@ __all__ = [
     "Replay",
     "SensorReport",
     "SessionForecast",
+    "SessionReport",
     "SessionSettings",
     "replay",
 ]

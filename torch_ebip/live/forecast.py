@@ -29,6 +29,8 @@ class SessionForecast(NamedTuple):
             demonstrated; below .01 hardly any of those is. NaN where it was not calibrated, see `learn`.
         states: of each sensor "ok", "suspect" (it counts less) or "rejected" (nothing, until it agrees again;
             also where the last of it was refused: out of range, or the same for too long).
+        finished: whether the interaction is over; what comes after needs `InteractionSession.restart`.
+        notes: what is wrong with time; see `SessionReport`.
     """
 
     time: float
@@ -42,9 +44,23 @@ class SessionForecast(NamedTuple):
     labels: Mapping[str, float] = MappingProxyType({})
     familiarity: float = math.nan
     states: Mapping[str, str] = MappingProxyType({})
+    finished: bool = False
+    notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         return brief(self)
+
+
+def as_present(now: float | None) -> float | None:
+    """A float of a time in s, whatever library the number is from; None for None.
+
+    Raises:
+        ValueError: it is no number.
+    """
+    try:
+        return None if now is None else float(now)
+    except (OverflowError, TypeError, ValueError) as error:
+        raise ValueError(f"now must be a finite time in seconds, got {str(now)[:40]}") from error
 
 
 MOST_POINTS = 10_000

@@ -12,37 +12,9 @@ import numpy.typing as npt
 
 from torch_ebip.interaction.bounds import demonstrated_range
 from torch_ebip.interaction.primitive import InteractionPrimitive
-from torch_ebip.interaction.surprise_memory import STATES
+from torch_ebip.live.report import SensorReport
 
 Array = npt.NDArray[np.float64]
-
-
-@dataclass
-class SensorReport:
-    """What became of what a sensor sent, counted in samples (a vector of all its DoFs).
-
-    Attributes:
-        accepted: used, at least in part, or still to be used.
-        nan, infinite, out_of_range: samples with such a value; the values are refused, the rest of the sample is not.
-        malformed: not a vector of as many numbers as the sensor has DoFs, or without a time.
-        late: older than the window.
-        early: from before the interaction, or too far ahead of it for any clock.
-        frozen: ticks at which the sensor said the same for too long.
-        last: time of the newest sample that was accepted, s; minus infinity if there is none.
-        state: "ok", "suspect" or "rejected", by how surprising it was when it was filtered last; see
-            `InteractionSurprise`.
-    """
-
-    accepted: int = 0
-    nan: int = 0
-    infinite: int = 0
-    out_of_range: int = 0
-    malformed: int = 0
-    late: int = 0
-    early: int = 0
-    frozen: int = 0
-    last: float = -math.inf
-    state: str = STATES[0]
 
 
 class Ranges(NamedTuple):
@@ -61,6 +33,28 @@ def training_ranges(primitive: InteractionPrimitive, margin: float) -> Ranges:
     noise = 5 * primitive.residual_variance.sqrt()
     low, high = ((value.double().cpu().numpy()) for value in (least - noise, most + noise))
     return Ranges(low - margin * (high - low), high + margin * (high - low))
+
+
+class Sample(NamedTuple):
+    """A sample that was looked at.
+
+    Attributes:
+        number: of the sensor.
+        values: [k], units of the DoFs, NaN for what cannot be; None without numbers or a time.
+        time: when it was taken, s; NaN if that is not known.
+        says: whether anything is left of it.
+        missing, infinite, outside: whether any value was NaN, infinite, or out of range.
+        impossible: whether nothing is left because it cannot be.
+    """
+
+    number: int
+    values: Array | None
+    time: float
+    says: bool = False
+    missing: bool = False
+    infinite: bool = False
+    outside: bool = False
+    impossible: bool = False
 
 
 @dataclass
@@ -117,32 +111,62 @@ class Intake:
         self.behind, self.ahead = behind, ahead
         self.reports = [SensorReport() for _ in columns]
         self._newest = [(-math.inf, False)] * len(columns)
+        self._limits = [(ranges.low[part].tolist(), ranges.high[part].tolist()) for part in columns]
         D = len(ranges.low)
         self._ring = [_Slot(np.full(D, np.nan)) for _ in range(behind + ahead + 2)]
         self._nothing = np.full(D, np.nan)
 
-    def put(self, modality: int, values: Any, time: Any, head: int) -> int | None:
-        """Store a sample if it can be used.
+    def look(self, modality: int, vector: Array | None, moment: float) -> Sample:
+        """What can be used of a sample; nothing is counted or stored.
 
         Args:
             modality: number of the sensor.
-            values: [k] numbers, units of the DoFs; anything else is counted as malformed.
-            time: when it was taken, s.
+            vector: [k] numbers, units of the DoFs, in memory of their own; None if it was not that.
+            moment: when it was taken, s; NaN if that is not known.
+        """
+        if vector is None or not math.isfinite(moment):
+            return Sample(modality, None, moment)
+        low, high = self._limits[modality]
+        values = vector.tolist()
+        if all(least <= value <= most for least, value, most in zip(low, values, high, strict=True)):
+            return Sample(modality, vector, moment, says=True)
+        missing = infinite = outside = impossible = says = False
+        for i, value in enumerate(values):
+            if low[i] <= value <= high[i]:
+                says = True
+                continue
+            if math.isnan(value):
+                missing = True
+                continue
+            impossible = True
+            if math.isinf(value):
+                infinite = True
+            else:
+                outside = True
+            values[i] = math.nan
+        return Sample(modality, np.array(values), moment, says, missing, infinite, outside, impossible and not says)
+
+    def refuse(self, sample: Sample) -> None:
+        """Count a sample that is ahead of every other clock."""
+        self._count(sample)
+        self.reports[sample.number].early += 1
+
+    def put(self, sample: Sample, head: int) -> int | None:
+        """Count a sample, and store it if it can be used.
+
+        Args:
+            sample: see `look`.
             head: newest tick that was filtered.
 
         Returns:
             The tick that it changes, or None.
         """
-        report, columns = self.reports[modality], self.columns[modality]
-        vector = as_vector(values, columns.stop - columns.start)
-        moment = as_number(time)
-        if vector is None or not math.isfinite(moment):
-            report.malformed += 1
+        report, columns = self.reports[sample.number], self.columns[sample.number]
+        self._count(sample)
+        vector, moment = sample.values, sample.time
+        if vector is None:
             return None
-        missing = np.isnan(vector).all()
-        vector = self._plausible(vector, columns, report)
-        impossible = bool(np.isnan(vector).all() and not missing)
-        self._newest[modality] = max(self._newest[modality], (moment, impossible))
+        self._newest[sample.number] = max(self._newest[sample.number], (moment, sample.impossible))
         place = (moment - self.start) / self.dt
         if place < -0.5 or place > head + self.ahead:
             report.early += 1
@@ -151,19 +175,19 @@ class Intake:
         if tick <= head - self.behind:
             report.late += 1
             return None
-        if np.isnan(vector).all():
+        if not sample.says:
             return None
         report.accepted += 1
         report.last = max(report.last, moment)
         slot = self._slot(tick)
         rank = (abs(place - tick), moment)
-        old = slot.taken.get(modality)
+        old = slot.taken.get(sample.number)
         if old is not None:
             # Of two samples that claim the same instant the bytes decide: any rule does that has no order in it.
             same = rank == old and vector.tobytes() <= slot.values[columns].tobytes()
             if old < rank or same:
                 return None
-        slot.taken[modality] = rank
+        slot.taken[sample.number] = rank
         slot.values[columns] = vector
         return tick
 
@@ -171,20 +195,6 @@ class Intake:
     def impossible(self) -> list[bool]:
         """Whether all that each modality measured last could not be: infinite, or out of range."""
         return [impossible for _, impossible in self._newest]
-
-    def says_something(self, modality: int, values: Any, time: Any) -> bool:
-        """Whether a sample of a sensor has a time and a value that can be; nothing is counted or stored.
-
-        Args:
-            modality: number of the sensor.
-            values: [k] numbers, units of the DoFs.
-            time: when it was taken, s.
-        """
-        columns = self.columns[modality]
-        vector = as_vector(values, columns.stop - columns.start)
-        if vector is None or not math.isfinite(as_number(time)):
-            return False
-        return not bool(np.isnan(self._plausible(vector, columns, SensorReport())).all())
 
     def at(self, tick: int) -> Array:
         """What was measured at a tick, [D]; NaN where nothing was. Not to be changed."""
@@ -230,16 +240,13 @@ class Intake:
         pairs = zip(self.reports, freshness.frozen.tolist(), strict=True)
         return [replace(report, frozen=frozen) for report, frozen in pairs]
 
-    def _plausible(self, vector: Array, columns: slice, report: SensorReport) -> Array:
-        """The vector with NaN for what cannot be."""
-        missing, infinite = np.isnan(vector), np.isinf(vector)
-        with np.errstate(invalid="ignore"):
-            outside = ~missing & ~infinite
-            outside &= (vector < self.ranges.low[columns]) | (vector > self.ranges.high[columns])
-        report.nan += bool(missing.any())
-        report.infinite += bool(infinite.any())
-        report.out_of_range += bool(outside.any())
-        return np.where(infinite | outside, np.nan, vector)
+    def _count(self, sample: Sample) -> None:
+        """What is wrong with it."""
+        report = self.reports[sample.number]
+        report.malformed += sample.values is None
+        report.nan += sample.missing
+        report.infinite += sample.infinite
+        report.out_of_range += sample.outside
 
     def _slot(self, tick: int) -> _Slot:
         slot = self._ring[tick % len(self._ring)]

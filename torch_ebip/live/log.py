@@ -1,7 +1,8 @@
 """A session on disk: one JSON value a line, written as things happen, so that a crash loses the last line at most.
 
-The first line says which session it was; then ``["push", sensor, time, values]``, ``["advance", now]`` and
-``["forecast", now, horizons, mean]`` in the order of the calls. Numbers are written with all their digits.
+The first line says which session it was; then ``["push", sensor, time, values]``, ``["advance", now]``,
+``["forecast", now, horizons, mean]`` and ``["restart", start]`` in the order in which they were taken in. Numbers are
+written with all their digits.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ import torch
 
 from torch_ebip.common.files import open_file
 
-FORMAT = 1
+FORMAT = 2
+READABLE = (1, 2)
+"""Formats that are understood; the first knew no ``restart``."""
 KIND = "torch_ebip session"
 LONGEST_LINE = 1 << 24
 """Characters; a longer line is not one of ours."""
@@ -92,12 +95,13 @@ def read_log(path: str | os.PathLike[str]) -> tuple[dict[str, Any], Iterator[lis
     header = None if first is None else first[1]
     if not isinstance(header, dict) or header.get("kind") != KIND:
         raise ValueError(f"{path}: not a recording of a session")
-    if header.get("format") != FORMAT:
-        raise ValueError(f"{path}: session format {header.get('format')}, this version reads {FORMAT}")
+    if header.get("format") not in READABLE:
+        readable = " and ".join(map(str, READABLE))
+        raise ValueError(f"{path}: session format {header.get('format')}, this version reads {readable}")
     return header, _entries(Path(path), lines)
 
 
-_KINDS = {"push": 4, "advance": 2, "forecast": 4}
+_KINDS = {"push": 4, "advance": 2, "forecast": 4, "restart": 2}
 
 
 def _entries(path: Path, lines: Iterator[tuple[int, Any]]) -> Iterator[list[Any]]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections import deque
 from itertools import pairwise
-from typing import Any
+
+from torch_ebip.live.intake import Sample
 
 FIRST_SAMPLE = "first sample"
 """A session that starts at the earliest time within a window of the first arrival."""
@@ -29,25 +30,24 @@ class Opening:
 
     Attributes:
         start: time of phase 0, s; None before the first sample.
-        pushes: those there were so far, the last `MOST`: number of the sensor, values, time.
+        pushes: samples there were so far, the last `MOST`.
     """
 
     def __init__(self, window: float) -> None:
         self.window = window
         self.start: float | None = None
-        self.pushes: deque[tuple[int, Any, float]] = deque(maxlen=MOST)
+        self.pushes: deque[Sample] = deque(maxlen=MOST)
         self._first = math.nan
 
-    def add(self, number: int, values: Any, moment: float, usable: bool) -> bool:
+    def add(self, sample: Sample, usable: bool) -> bool:
         """Take note of a sample; whether the start is another one now.
 
         Args:
-            number: of the sensor.
-            values: of the sample, in memory of their own.
-            moment: when it was taken, s; NaN if that is not known.
-            usable: whether the sample says anything: the others do not begin an interaction.
+            sample: with the time when it was taken, s; NaN if that is not known.
+            usable: whether it says anything: the others do not begin an interaction.
         """
-        self.pushes.append((number, values, moment))
+        self.pushes.append(sample)
+        moment = sample.time
         if not usable:
             return False
         if self.start is None:
@@ -63,7 +63,7 @@ class Opening:
         return self.start is not None and newest > self._first + self.window
 
 
-class Clock:
+class Units:
     """Looks at the times of samples: whether they can be seconds.
 
     They cannot where they are too large for any clock, or where a sensor would say something less often than every
@@ -121,22 +121,20 @@ class Lost:
     def __init__(self, reach: float) -> None:
         self._reach = reach
         self._accepted = 0
-        self._samples: list[tuple[int, Any, float]] = []
+        self._samples: list[Sample] = []
 
-    def add(self, number: int, values: Any, moment: float, accepted: bool) -> list[tuple[int, Any, float]] | None:
+    def add(self, sample: Sample, accepted: bool) -> list[Sample] | None:
         """Take note of a sample that says something; those to begin again with, once there are enough.
 
         Args:
-            number: of the sensor.
-            values: of the sample, in memory of their own.
-            moment: when it was taken, s.
+            sample: with the time when it was taken, s.
             accepted: whether it was in reach.
         """
         self._accepted += accepted
         if accepted or self._accepted >= ENOUGH:
             return None
-        self._samples = [*self._samples[-ENOUGH:], (number, values, moment)]
-        times = [time for _, _, time in self._samples]
+        self._samples = [*self._samples[-ENOUGH:], sample]
+        times = [known.time for known in self._samples]
         if len(times) <= max(ENOUGH, self._accepted) or max(times) - min(times) > self._reach:
             return None
         samples, self._samples, self._accepted = self._samples, [], 0

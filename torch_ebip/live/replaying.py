@@ -17,6 +17,8 @@ from torch_ebip.live.log import fingerprint, read_log
 from torch_ebip.live.session import InteractionSession
 from torch_ebip.live.settings import SessionSettings
 
+NEWER = {"delays", "correct_clocks"}
+"""Settings that recordings of the first format do not know."""
 MOST_TICKS = 2000
 """Of a window, and of a gap."""
 MOST_MEMORY = 1 << 28
@@ -67,6 +69,7 @@ def replay(path: str | os.PathLike[str], filter: InteractionFilter, primitive: I
             raise ValueError(f"{path}: recorded with another {name} than this one")
     try:
         known = {field.name for field in fields(SessionSettings)}
+        known -= NEWER if header["format"] == 1 else set()
         if set(header["settings"]) != known:
             raise ValueError(f"expected {', '.join(sorted(known))}, got {str(header['settings'])[:200]}")
         settings = SessionSettings(**header["settings"])
@@ -88,6 +91,8 @@ def replay(path: str | os.PathLike[str], filter: InteractionFilter, primitive: I
                 session.push(entry[1], entry[3], entry[2])
             elif entry[0] == "advance":
                 session.advance(entry[1])
+            elif entry[0] == "restart":
+                session.restart(entry[1])
             else:
                 if isinstance(entry[2], list) and len(entry[2]) > MOST_HORIZONS:
                     raise ValueError(f"more than {MOST_HORIZONS} horizons")

@@ -4,7 +4,9 @@ Time is cut into ticks as far apart as the demonstrations' samples. A filter tak
 with the sample of every sensor that was taken nearest to it. A sample that arrives late belongs to a tick that is
 past: the filter is wound back to the tick before and takes in again what followed (fixed-lag replay), with the draws
 it had. So the state depends on what was measured and when, never on the order in which it arrived nor on when
-somebody asked.
+somebody asked. (What always arrives late is repeated a few ticks at a time: see `torch_ebip.live.track`.)
+
+Sensors leave their samples in a queue. They are looked at, recorded and filtered by whoever asks.
 """
 
 from __future__ import annotations
@@ -13,29 +15,30 @@ import math
 import os
 import threading
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from types import TracebackType
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
 from torch_ebip.common.ambient import in_own_modes
 from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.primitive import InteractionPrimitive
-from torch_ebip.live.forecast import SessionForecast, sampled
-from torch_ebip.live.intake import SensorReport, as_number
+from torch_ebip.live.arrivals import HELP, Arrival, Arrivals
+from torch_ebip.live.forecast import SessionForecast, as_present, sampled
+from torch_ebip.live.intake import as_number
 from torch_ebip.live.log import SessionLog, fingerprint
+from torch_ebip.live.opening import FIRST_SAMPLE
+from torch_ebip.live.report import SessionReport
 from torch_ebip.live.settings import SessionSettings
 from torch_ebip.live.timeline import Timeline
-
-TOLERANCE = 1e-3
-"""Ticks by which a time may be short of a tick and still be it: clocks that count from 1970 round to microseconds."""
 
 
 class InteractionSession:
     """Filters one interaction as it happens. Bad sensor values never raise: they are refused and counted.
 
-    Its methods may be called from several threads; they wait for each other.
+    Its methods may be called from several threads. `push` waits for nobody; the others wait for each other. It lives
+    in the process that made it, and is not copied.
 
     Args:
         filter: of the primitive, tuned or not: any kind. Not changed, and not to be changed while the session lasts.
@@ -86,7 +89,9 @@ class InteractionSession:
         self._numbers = {name: i for i, name in enumerate(self.sensors)}
         self._timeline = Timeline(filter, primitive, self.sensors, settings)
         self._longest = float(primitive.durations.max())
+        self._arrivals = Arrivals()
         self._lock = threading.RLock()
+        self._process, self._closed = os.getpid(), False
         self._log: SessionLog | None = None
         if record is not None:
             header = {
@@ -98,7 +103,7 @@ class InteractionSession:
             self._log = SessionLog(record, header)
 
     def push(self, sensor: str, values: Any, time: Any) -> None:
-        """Take a sample of a sensor; costs microseconds, the filter does its work when it is asked.
+        """Take a sample of a sensor; it waits in a queue until somebody asks, and `push` for nobody.
 
         Args:
             sensor: name of a modality.
@@ -106,16 +111,37 @@ class InteractionSession:
             time: when it was taken, s.
 
         Raises:
-            ValueError: no such sensor. Nothing else: see `report`.
+            ValueError: no such sensor.
+            RuntimeError: the session was closed, or made in another process. Nothing else: see `report`.
         """
         number = self._numbers.get(sensor)
         if number is None:
             raise ValueError(f"no sensor {sensor!r}; this session has {', '.join(self.sensors)}")
-        with self._lock:
-            vector, moment = self._timeline.plain(number, values), as_number(time)
+        self._check()
+        self._arrivals.put(Arrival(number, self._timeline.plain(number, values), as_number(time)))
+        if self._arrivals.many and self._lock.acquire(blocking=False):
+            try:
+                self._take_in(HELP)
+            finally:
+                self._lock.release()
+
+    @in_own_modes
+    def _take_in(self, most: int | None = None) -> None:
+        """What is in the queue, at most so many samples; with the lock held."""
+        for number, values, time in self._arrivals.take(most):
             if self._log is not None:
-                self._log.write(["push", sensor, moment, None if vector is None else vector.tolist()])
-            self._timeline.push(number, vector, moment)
+                self._log.write(["push", self.sensors[number], time, None if values is None else values.tolist()])
+            self._timeline.push(number, values, time)
+
+    def _check(self) -> None:
+        """Refuse a session that was closed, or that a fork has copied."""
+        if self._closed:
+            raise RuntimeError("this session was closed; make a new one")
+        if os.getpid() != self._process:
+            raise RuntimeError(
+                f"this session belongs to process {self._process}, whose threads and recording a fork does not copy; "
+                "make a new one here"
+            )
 
     @in_own_modes
     def advance(self, now: float | None = None) -> None:
@@ -126,9 +152,12 @@ class InteractionSession:
 
         Raises:
             ValueError: it is not finite, or further ahead than ``longest_gap``.
+            RuntimeError: the session was closed, or made in another process.
         """
-        now = _plain(now)
+        self._check()
+        now = as_present(now)
         with self._lock:
+            self._take_in()
             self._timeline.advance(now)
             if self._log is not None:
                 self._log.write(["advance", now])
@@ -153,8 +182,10 @@ class InteractionSession:
         Raises:
             ValueError: see `advance`; a horizon that is not finite; several of them with a rate; a rate that is not
                 positive, or asks for more than `MOST_POINTS`.
+            RuntimeError: the session was closed, or made in another process.
         """
-        now = _plain(now)
+        self._check()
+        now = as_present(now)
         several = horizon is not None and np.ndim(horizon) > 0
         horizons = [] if horizon is None else np.atleast_1d(np.asarray(horizon, dtype=np.float64)).tolist()
         if not all(math.isfinite(h) for h in horizons):
@@ -162,6 +193,7 @@ class InteractionSession:
         if rate is not None and several:
             raise ValueError("a rate goes with one horizon, up to which the way is sampled, not with several")
         with self._lock:
+            self._take_in()
             self._timeline.advance(now)
             timeline = self._timeline
             left = timeline.time_to_end()
@@ -180,7 +212,30 @@ class InteractionSession:
             return SessionForecast(
                 now, phase, left, self.dofs, mean, deviation, stale, tuple(horizons),
                 timeline.labels(), timeline.familiarity(), dict(zip(self.sensors, timeline.states(), strict=True)),
+                timeline.finished, timeline.notes(),
             )  # fmt: skip
+
+    @in_own_modes
+    def restart(self, start: float | str | None = None) -> None:
+        """Another interaction, with the same filter, sensors, settings and draws: as a new session, at no cost.
+
+        What is in the queue belongs to the interaction before, and so does what was taken before the present. Reports
+        begin anew; what was learned of the clocks stays. A recording goes on.
+
+        Args:
+            start: see `SessionSettings`; default: the first sample.
+
+        Raises:
+            ValueError: a start that is no finite time, nor the first sample.
+            RuntimeError: the session was closed, or made in another process.
+        """
+        self._check()
+        start = replace(self.settings, start=FIRST_SAMPLE if start is None else start).start
+        with self._lock:
+            self._take_in()
+            self._timeline.restart(start)
+            if self._log is not None:
+                self._log.write(["restart", start])
 
     @property
     def failed_updates(self) -> int:
@@ -194,16 +249,35 @@ class InteractionSession:
         with self._lock:
             return self._timeline.ticks
 
-    def report(self) -> dict[str, SensorReport]:
-        """What became of everything that was pushed, by sensor."""
+    def report(self) -> SessionReport:
+        """What became of everything that was pushed since the interaction began, by sensor; and notes about time."""
         with self._lock:
-            return dict(zip(self.sensors, self._timeline.report(), strict=True))
+            self._take_in()
+            return self._timeline.report()
 
     def close(self) -> None:
-        """End the recording, if there is one."""
+        """Take in what waits, and end the recording, if there is one. Only `report` answers after that."""
+        if os.getpid() != self._process:  # of the parent; who holds the lock there is not here
+            return
         with self._lock:
+            self._closed = True
+            self._take_in()
             if self._log is not None:
                 self._log.close()
+
+    def __reduce__(self) -> NoReturn:
+        """Neither copied nor pickled."""
+        raise TypeError(
+            "a session is one interaction at work and is not copied; make a new one, or record this one and replay it"
+        )
+
+    def __copy__(self) -> NoReturn:
+        """See `__reduce__`."""
+        self.__reduce__()
+
+    def __deepcopy__(self, memo: object) -> NoReturn:
+        """See `__reduce__`."""
+        self.__reduce__()
 
     def __repr__(self) -> str:
         return (
@@ -218,11 +292,3 @@ class InteractionSession:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def _plain(now: float | None) -> float | None:
-    """A float, whatever library the number is from."""
-    try:
-        return None if now is None else float(now)
-    except (OverflowError, TypeError, ValueError) as error:
-        raise ValueError(f"now must be a finite time in seconds, got {str(now)[:40]}") from error

@@ -33,6 +33,11 @@ class SessionSettings:
         stale_after: without anything usable for how long a sensor is reported stale.
         longest_gap: by how much the present, or a sample, may be ahead of what was filtered last.
         seed: of all draws.
+        delays: by name of a sensor, by how much its stamps are later than what it measured, where that is known: of a
+            camera whose pictures are stamped on arrival, say. Taken off the stamps.
+        correct_clocks: whether jumps of a sensor's clock are taken out of its stamps. They are reported in any case;
+            uncorrected, a sensor whose clock is ahead of all others is refused. Where ``now`` is not given, a gap in
+            which no sensor says anything is taken for a jump then.
 
     Raises:
         ValueError: a setting outside its range.
@@ -46,6 +51,8 @@ class SessionSettings:
     stale_after: float = 0.1
     longest_gap: float = 10.0
     seed: int = 0
+    delays: Mapping[str, float] | None = None
+    correct_clocks: bool = False
 
     def __post_init__(self) -> None:
         """Checks, and makes plain numbers of those of other libraries."""
@@ -56,6 +63,10 @@ class SessionSettings:
                     raise ValueError(f"start must be a time in seconds or {FIRST_SAMPLE!r}, got {value[:40]!r}")
             elif field.name == "seed":
                 value = as_count("seed", value, -(2**63))
+            elif field.name == "correct_clocks":
+                if str(value) not in ("True", "False"):
+                    raise ValueError(f"correct_clocks must be True or False, got {str(value)[:40]!r}")
+                value = bool(value)
             elif isinstance(value, Mapping):
                 value = {
                     str(sensor): _real(f"{field.name} of {sensor!r}", number) for sensor, number in value.items()
@@ -75,6 +86,9 @@ class SessionSettings:
         for name in ("start", "window", "longest_gap"):
             if getattr(self, name) != FIRST_SAMPLE and not math.isfinite(getattr(self, name)):
                 raise ValueError(f"{name} must be finite, got {getattr(self, name)}")
+        for sensor, delay in (self.delays or {}).items():
+            if not math.isfinite(delay):
+                raise ValueError(f"delays of {sensor!r} must be a finite number of seconds, got {delay}")
         if not self.margin >= 0:
             raise ValueError(f"margin must not be negative, got {self.margin}")
         if not 0 <= self.settle < self.window:
@@ -107,3 +121,12 @@ def patience_of(
     if strangers:
         raise ValueError(f"frozen_after names {', '.join(strangers)}; the sensors are {', '.join(sensors)}")
     return [frozen_after.get(name, usual[name]) for name in sensors]
+
+
+def delays_of(delays: Mapping[str, float] | None, sensors: Sequence[str]) -> list[float]:
+    """Seconds by which the stamps of each sensor are late; see `SessionSettings`."""
+    delays = delays or {}
+    strangers = [name for name in delays if name not in sensors]
+    if strangers:
+        raise ValueError(f"delays name {', '.join(strangers)}; the sensors are {', '.join(sensors)}")
+    return [delays.get(name, 0.0) for name in sensors]

@@ -6,18 +6,20 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-import torch
-
 from torch_ebip.common.modules import sharing
 from torch_ebip.interaction.bounds import Bounds
 from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.forecast import Forecast
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.interaction.surprise_memory import STATES, state_of
+from torch_ebip.live.clocks import Clocks
 from torch_ebip.live.engine import make_engine
-from torch_ebip.live.intake import Array, Freshness, Intake, SensorReport, as_vector, training_ranges
-from torch_ebip.live.opening import Clock, Lost, Opening
-from torch_ebip.live.settings import SessionSettings, patience_of
+from torch_ebip.live.intake import Array, Intake, Sample, as_vector, training_ranges
+from torch_ebip.live.notes import notes
+from torch_ebip.live.opening import Lost, Opening, Units
+from torch_ebip.live.report import SessionReport
+from torch_ebip.live.settings import SessionSettings, delays_of, patience_of
+from torch_ebip.live.track import REPEATS, Track
 
 TOLERANCE = 1e-3
 """Ticks by which a time may be short of a tick and still be it: clocks that count from 1970 round to microseconds."""
@@ -31,9 +33,6 @@ class Timeline:
         primitive: of the demonstrations.
         sensors: names of modalities, M of them.
         settings: how to treat them.
-
-    Attributes:
-        ticks: how many the filter was led through so far, repeated ones included.
     """
 
     def __init__(
@@ -44,33 +43,45 @@ class Timeline:
         settings: SessionSettings,
     ) -> None:
         layout, dt = primitive.layout, filter.dt
-        self.settings, self.dt = settings, dt
-        self._patience = patience_of(settings.frozen_after, primitive, sensors)
+        self.settings, self.dt, self._names = settings, dt, tuple(sensors)
         # A sample may belong to a tick half a tick before it was taken.
         behind = math.floor(settings.window / dt + 0.5 + TOLERANCE) + 1
         self._modalities = [layout.names.index(name) for name in sensors]
         self._columns = [layout.slice(name) for name in sensors]
         self._ranges = training_ranges(primitive, settings.margin)
         self._reach = behind, math.ceil(settings.longest_gap / dt)
-        self._slots = behind + 2
-        # One more than are in turn: the state before anything was seen.
+        slots = behind + 2
         # Whatever it believes, what it says stays near what was demonstrated.
         filter = sharing(filter)
         filter.bounds = Bounds.of(primitive) if filter.bounds is None else filter.bounds
-        self._engine = make_engine(filter, layout.mask(sensors), layout.controlled, self._slots + 1, settings.seed)
-        self._engine.save(self._slots)
+        # Two states beside those of the ticks: before anything was seen, and where the past is being repeated.
+        self._engine = make_engine(filter, layout.mask(sensors), layout.controlled, slots + 2, settings.seed)
         self._like = next(filter.parameters())
-        longest = float(primitive.durations.max())
+        self._track = Track(self._engine, slots, patience_of(settings.frozen_after, primitive, sensors), self._like)
         self._periodic = primitive.periodic
-        self._clock = Clock(dt, longest, len(sensors))
-        self._lost = Lost(settings.longest_gap) if isinstance(settings.start, str) else None
-        self._opening = Opening(settings.window) if isinstance(settings.start, str) else None
-        self.ticks = 0
-        self._head: int
-        self._dirty: int
-        self._freshness: list[Freshness]
+        self._units = Units(dt, float(primitive.durations.max()), len(sensors))
+        delays = delays_of(settings.delays, sensors)
+        self._clocks = Clocks(dt, settings.window, settings.correct_clocks, delays)
+        self._before = -math.inf
+        self._open(settings.start)
+
+    def restart(self, start: float | str) -> None:
+        """Another interaction: nothing was seen of it yet. What was learned of the clocks stays."""
+        self._before = max(self._now, self._newest) if isinstance(start, str) else -math.inf
+        self._clocks.forget()
+        self._open(start)
+
+    def _open(self, start: float | str) -> None:
+        """Wait for the first sample, or for a time, s."""
+        found = isinstance(start, str)
+        self._lost = Lost(self.settings.longest_gap) if found else None
+        self._opening = Opening(self.settings.window) if found else None
         self._now = self._newest = -math.inf
-        self._begin(0.0 if isinstance(settings.start, str) else settings.start)
+        self._first = math.nan
+        self._given = not found
+        self._turned_back = 0.0
+        self._over: float | None = None
+        self._begin(0.0 if isinstance(start, str) else start)
 
     @property
     def waiting(self) -> bool:
@@ -85,7 +96,12 @@ class Timeline:
     @property
     def failed(self) -> int:
         """How many ticks the filter could not take in."""
-        return self._current().failed
+        return self._track.freshness.failed
+
+    @property
+    def ticks(self) -> int:
+        """See `Track`."""
+        return self._track.ticks
 
     def plain(self, number: int, values: object) -> Array | None:
         """The numbers of what a sensor sent, in memory of their own; None if it is not what it has."""
@@ -95,38 +111,49 @@ class Timeline:
     def push(self, number: int, vector: Array | None, moment: float) -> None:
         """Take a sample of a sensor, `plain` numbers, taken at a time in s, NaN if it is none."""
         if vector is not None:
-            self._clock.see(number, moment)
+            self._units.see(number, moment)
+        for sample in self._clocks.admit(self._intake.look(number, vector, moment)):
+            self._put(sample)
+        for sample in self._clocks.refused():
+            self._intake.refuse(sample)
+
+    def _put(self, sample: Sample) -> None:
+        """Store a sample of a clock that can be believed, and find out with it when the interaction began."""
         opening = self._opening
         if opening is None:
-            usable = self._lost is not None and self._intake.says_something(number, vector, moment)
-            before = self._intake.reports[number].early
-            self._take(number, vector, moment)
-            if usable:
-                self._find(number, vector, moment, self._intake.reports[number].early == before)
+            before = self._intake.reports[sample.number].early
+            self._take(sample)
+            if self._lost is not None and sample.says:
+                self._find(sample, self._intake.reports[sample.number].early == before)
             return
-        usable, waiting = self._intake.says_something(number, vector, moment), self.waiting
-        if opening.add(number, vector, moment, usable) and opening.start is not None:
+        waiting, usable = self.waiting, sample.says
+        if usable and sample.time <= self._before:  # of the interaction before this one
+            self._intake.refuse(sample)
+            return
+        if opening.add(sample, usable) and opening.start is not None:
             if waiting:  # what was asked before does not bind the clock of the samples
                 self._now = -math.inf
             self._begin(opening.start)
             for earlier in opening.pushes:
-                self._take(*earlier)
+                self._take(earlier)
         else:
-            self._take(number, vector, moment)
-        if usable and opening.over(moment):
+            self._take(sample)
+        if usable and opening.over(sample.time):
             self._opening = None
         if usable and not waiting:
-            early = abs(moment - self._start) > self.settings.longest_gap
-            self._find(number, vector, moment, not early)
+            early = abs(sample.time - self._start) > self.settings.longest_gap
+            self._find(sample, not early)
 
-    def _find(self, number: int, vector: Array | None, moment: float, accepted: bool) -> None:
+    def _find(self, sample: Sample, accepted: bool) -> None:
         """Begin again where samples agree, if none of them is near the first."""
-        again = None if self._lost is None else self._lost.add(number, vector, moment, accepted)
+        again = None if self._lost is None else self._lost.add(sample, accepted)
         if again is not None:
             self._opening = Opening(self.settings.window)
             self._now = self._newest = -math.inf
-            for sample in again:
-                self.push(*sample)
+            self._clocks.forget(offsets=True)
+            for known in again:
+                self._clocks.believe(known)
+                self._put(known)
 
     def advance(self, now: float | None) -> None:
         """Filter up to the present, s; default: the newest time of any sample.
@@ -136,27 +163,28 @@ class Timeline:
         """
         if now is not None and not math.isfinite(now):
             raise ValueError(f"now must be a finite time in seconds, got {now}")
-        unit = self._clock.guess(now)
+        unit = self._units.guess(now)
         if unit is not None:
             raise ValueError(f"times seem to be in {unit}; push and ask in seconds")
         if self.waiting:
             self._now = self._now if now is None else max(self._now, now)
             return
         if now is not None:
-            gap = now - self._time(max(self._head, 0))
+            gap = now - self._time(max(self._track.head, 0))
             if gap > self.settings.longest_gap:
                 raise ValueError(
                     f"now = {now} s is {gap:.1f} s after what was filtered last, more than the longest gap of "
-                    f"{self.settings.longest_gap} s; begin a new session"
+                    f"{self.settings.longest_gap} s; begin a new session, or `restart` this one"
                 )
+            self._turned_back = max(self._now - now, 0.0)
+            for sample in self._clocks.tell(now):
+                self._put(sample)
+        before = self._now
         self._now = max(self._now, self._start, self._newest if now is None else now)
         newest = math.floor((self._now - self.settings.settle - self._start) / self.dt + TOLERANCE)
-        if self._dirty <= self._head:
-            self._head = self._dirty - 1
-            self._engine.load(self._head % self._slots)
-        while self._head < newest:
-            self._step()
-        self._dirty = self._head + 1
+        self._track.advance(newest, whole=self._now == before)
+        if self.finished and self._over is None:
+            self._over = self._now
 
     def phase_now(self) -> tuple[float, float]:
         """Phase and its velocity, 1/s, at the present: since the last tick the interaction went on."""
@@ -179,6 +207,14 @@ class Timeline:
         rest = 0.0 if waits is None else float(waits.rest)
         return (1 - self.place()) / velocity + rest
 
+    @property
+    def finished(self) -> bool:
+        """Whether the interaction is over: nearer to its end than half a tick. What repeats never is."""
+        if self._periodic or self.waiting:
+            return False
+        _, velocity = self.phase_now()
+        return self.place() >= 1 - max(velocity, 0.0) * self.dt / 2
+
     def forecast(self, horizons: Sequence[float]) -> Forecast:
         """Of the controlled DoFs so many seconds ahead of the present; infinity: the end.
 
@@ -197,7 +233,7 @@ class Timeline:
 
     def _since(self) -> float:
         """How long ago the last tick was, s."""
-        return 0.0 if self.waiting else max(self._now - self._time(max(self._head, 0)), 0.0)
+        return 0.0 if self.waiting else max(self._now - self._time(max(self._track.head, 0)), 0.0)
 
     def labels(self) -> dict[str, float]:
         """Probability of each label."""
@@ -211,64 +247,44 @@ class Timeline:
         """Of each sensor, see `SessionForecast`."""
         counts = self._engine.counts()
         states = [STATES[0] if counts is None else state_of(counts[number]) for number in self._modalities]
-        refused = zip(self._intake.impossible, self._current().still.tolist(), strict=True)
+        refused = zip(self._intake.impossible, self._track.freshness.still.tolist(), strict=True)
         return [STATES[2] if any(why) else state for why, state in zip(refused, states, strict=True)]
 
     def stale(self) -> list[int]:
         """Numbers of the sensors of which nothing was used for a while, or ever."""
         oldest = self._now - self.settings.stale_after
-        used = self._current().used.tolist()
+        used = self._track.freshness.used.tolist()
         return [i for i, tick in enumerate(used) if tick < 0 or self._time(tick) < oldest]
 
-    def report(self) -> list[SensorReport]:
-        """A copy of the counts of each sensor."""
-        reports = self._intake.report(self._current())
-        return [replace(report, state=state) for report, state in zip(reports, self.states(), strict=True)]
+    def report(self) -> SessionReport:
+        """A copy of the counts of each sensor, and what is wrong with time."""
+        of = zip(self._intake.report(self._track.freshness), self.states(), self._clocks.sensors, strict=True)
+        full = [clock.reported(replace(report, state=state)) for report, state, clock in of]
+        return SessionReport(dict(zip(self._names, full, strict=True)), self.notes())
+
+    def notes(self) -> tuple[str, ...]:
+        """See `SessionReport`."""
+        began = self._first - self._start if self._given else 0.0
+        reports, said = self._intake.reports, (began, self._turned_back, self._over)
+        return notes(self._names, self._clocks, reports, self.settings, self.dt, *said)
 
     def _begin(self, start: float) -> None:
         """Start at this time, s, with nothing seen."""
         self._start = start
         self._intake = Intake(self._columns, self._ranges, start, self.dt, *self._reach)
-        self._freshness = [self._intake.fresh() for _ in range(self._slots)]
-        self._head, self._dirty = -1, 0
-        self._engine.load(self._slots)
-        self._engine.save(-1 % self._slots)
+        self._track.begin(self._intake)
 
-    def _take(self, number: int, vector: Array | None, moment: float) -> None:
+    def _take(self, sample: Sample) -> None:
         """Store a sample in its tick."""
-        if self.waiting and math.isfinite(moment):  # it says nothing: only what is wrong with it is counted
-            self._intake.start = moment
-        tick = self._intake.put(number, vector, moment, self._head)
-        self._newest = max(self._newest, self._intake.reports[number].last)
+        if self.waiting and math.isfinite(sample.time):  # it says nothing: only what is wrong with it is counted
+            self._intake.start = sample.time
+        tick = self._intake.put(sample, self._track.head)
+        self._newest = max(self._newest, self._intake.reports[sample.number].last)
         if tick is not None:
-            self._dirty = min(self._dirty, tick)
-
-    def _current(self) -> Freshness:
-        return self._freshness[self._head % self._slots]
+            if self._given and not self._first <= sample.time:
+                self._first = sample.time
+            late = self._clocks.sensors[sample.number].lateness - self.settings.settle
+            self._track.changed(tick, late > REPEATS * self.dt)
 
     def _time(self, tick: int) -> float:
         return self._start + tick * self.dt
-
-    def _step(self) -> None:
-        """One more tick."""
-        freshness = self._current().copy()
-        self._head += 1
-        self.ticks += 1
-        if self._head > 0:
-            self._engine.predict()
-        values, usable = self._intake.usable(self._head, freshness, self._patience)
-        if usable.any():
-            y = torch.as_tensor(values, dtype=self._like.dtype, device=self._like.device)
-            try:
-                self._engine.update(y, tuple(usable.tolist()))
-                done = self._engine.finite()
-            except ValueError:
-                done = False
-            if not done:
-                # Back to before the tick: this one is left out, as if nothing had been measured.
-                freshness.failed += 1
-                self._engine.load((self._head - 1) % self._slots)
-                if self._head > 0:
-                    self._engine.predict()
-        self._freshness[self._head % self._slots] = freshness
-        self._engine.save(self._head % self._slots)
