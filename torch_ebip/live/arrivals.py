@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from queue import SimpleQueue
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from torch_ebip.live.intake import Array
+import numpy as np
+
+from torch_ebip.live.intake import as_vector
 
 MOST_WAITING = 4096
 """Samples that may wait; beyond that who brings one helps to take some in."""
@@ -14,17 +16,32 @@ HELP = 2
 
 
 class Arrival(NamedTuple):
-    """A sample as it came.
+    """A sample as it came, not yet looked at.
 
     Attributes:
         number: of the sensor.
-        values: [k], units of its DoFs; None if it was not that.
+        values: whatever it sent, in memory of its own.
         time: when it was taken, s; NaN if that is not known.
     """
 
     number: int
-    values: Array | None
+    values: Any
     time: float
+
+
+def kept(values: Any, length: int) -> Any:
+    """What a sensor sent, so that it may write into its buffer again; as little work as that takes.
+
+    Args:
+        values: anything.
+        length: how many numbers it should be.
+    """
+    kind = type(values)
+    if kind is np.ndarray:
+        return values.copy() if values.shape == (length,) else None
+    if kind is tuple or kind is list:
+        return tuple(values) if len(values) == length else None
+    return as_vector(values, length)
 
 
 class Arrivals:

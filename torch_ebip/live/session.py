@@ -24,9 +24,9 @@ import numpy as np
 from torch_ebip.common.ambient import in_own_modes
 from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.primitive import InteractionPrimitive
-from torch_ebip.live.arrivals import HELP, Arrival, Arrivals
+from torch_ebip.live.arrivals import HELP, Arrival, Arrivals, kept
 from torch_ebip.live.forecast import SessionForecast, as_present, sampled
-from torch_ebip.live.intake import as_number
+from torch_ebip.live.intake import as_number, as_vector
 from torch_ebip.live.log import SessionLog, fingerprint
 from torch_ebip.live.opening import FIRST_SAMPLE
 from torch_ebip.live.report import SessionReport
@@ -86,6 +86,7 @@ class InteractionSession:
         self.settings = settings = SessionSettings() if settings is None else settings
         self.sensors, self.dt = tuple(sensors), filter.dt
         self.dofs = tuple(dof for dof, ours in zip(layout.dofs, layout.controlled.tolist(), strict=True) if ours)
+        self._lengths = [len(layout[name].dofs) for name in self.sensors]
         self._numbers = {name: i for i, name in enumerate(self.sensors)}
         self._timeline = Timeline(filter, primitive, self.sensors, settings)
         self._longest = float(primitive.durations.max())
@@ -117,8 +118,10 @@ class InteractionSession:
         number = self._numbers.get(sensor)
         if number is None:
             raise ValueError(f"no sensor {sensor!r}; this session has {', '.join(self.sensors)}")
-        self._check()
-        self._arrivals.put(Arrival(number, self._timeline.plain(number, values), as_number(time)))
+        if self._closed or os.getpid() != self._process:
+            self._check()
+        moment = time if type(time) is float else as_number(time)
+        self._arrivals.put(Arrival(number, kept(values, self._lengths[number]), moment))
         if self._arrivals.many and self._lock.acquire(blocking=False):
             try:
                 self._take_in(HELP)
@@ -128,7 +131,8 @@ class InteractionSession:
     @in_own_modes
     def _take_in(self, most: int | None = None) -> None:
         """What is in the queue, at most so many samples; with the lock held."""
-        for number, values, time in self._arrivals.take(most):
+        for number, sent, time in self._arrivals.take(most):
+            values = as_vector(sent, self._lengths[number])
             if self._log is not None:
                 self._log.write(["push", self.sensors[number], time, None if values is None else values.tolist()])
             self._timeline.push(number, values, time)

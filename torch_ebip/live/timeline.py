@@ -14,7 +14,7 @@ from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.interaction.surprise_memory import STATES, state_of
 from torch_ebip.live.clocks import Clocks
 from torch_ebip.live.engine import make_engine
-from torch_ebip.live.intake import Array, Intake, Sample, as_vector, training_ranges
+from torch_ebip.live.intake import Array, Intake, Sample, training_ranges
 from torch_ebip.live.notes import notes
 from torch_ebip.live.opening import Lost, Opening, Units
 from torch_ebip.live.report import SessionReport
@@ -103,13 +103,8 @@ class Timeline:
         """See `Track`."""
         return self._track.ticks
 
-    def plain(self, number: int, values: object) -> Array | None:
-        """The numbers of what a sensor sent, in memory of their own; None if it is not what it has."""
-        columns = self._columns[number]
-        return as_vector(values, columns.stop - columns.start)
-
     def push(self, number: int, vector: Array | None, moment: float) -> None:
-        """Take a sample of a sensor, `plain` numbers, taken at a time in s, NaN if it is none."""
+        """Take a sample of a sensor, numbers in memory of their own, taken at a time in s, NaN if it is none."""
         if vector is not None:
             self._units.see(number, moment)
         for sample in self._clocks.admit(self._intake.look(number, vector, moment)):

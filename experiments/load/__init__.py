@@ -1,0 +1,1 @@
+"""Sessions under load: whether `push` waits for anybody, and every forecast is in time."""
