@@ -83,7 +83,7 @@ def under_load(
 def figure(measured: Mapping[str, Any]) -> Figure:
     """How long things take, and memory."""
     made, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
-    for name in ("bare", "push", "alone", "forecast"):
+    for name in LABELS:
         values = np.sort(measured[name])
         beyond = 1 - np.arange(len(values)) / len(values)
         left.loglog(1e3 * values.clip(1e-7), beyond, lw=1.3, label=LABELS[name])
@@ -99,10 +99,13 @@ def figure(measured: Mapping[str, Any]) -> Figure:
     return made
 
 
+LATE = 0.2
+"""Seconds that one of the sensors is late, in one of the measurements."""
 LABELS = {
     "bare": "SimpleQueue.put",
     "push": "session.push",
     "alone": "forecast, nothing else going on",
+    "behind": "the same, a sensor 200 ms late",
     "forecast": "forecast under load, from when it is due",
 }
 
@@ -129,6 +132,8 @@ def main(arguments: list[str] | None = None) -> None:
     )
     with InteractionSession(filter, primitive) as session:
         measured: dict[str, Any] = {"alone": alone(session, shown, names, 1200, POLLS)}
+    with InteractionSession(filter, primitive) as session:
+        measured["behind"] = alone(session, shown, names, 1200, POLLS, round(LATE * POLLS))
     with InteractionSession(filter, primitive) as session:
         measured |= under_load(session, shown, names, options)
     times = {

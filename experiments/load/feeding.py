@@ -66,16 +66,18 @@ class Feeder(threading.Thread):
 
 
 def alone(
-    session: InteractionSession, shown: Demonstrations, names: list[str], polls: int, rate: float
+    session: InteractionSession, shown: Demonstrations, names: list[str], polls: int, rate: float, late: int = 0
 ) -> np.ndarray:
-    """What a forecast takes when nothing else goes on, s, [polls]."""
+    """What a forecast takes when nothing else goes on, s, [polls]; the first sensor may be so many samples late."""
     taken, start, which, tick = np.empty(polls), 0.0, 0, 0
     for i in range(polls):
         values = shown[which]
         now = start + tick / rate
-        row = values[min(int(tick / rate * shown.rate), len(values) - 1)]
         for name in names:
-            session.push(name, row[shown.layout.slice(name)], now)
+            at = tick - late * (name == names[0])
+            if at >= 0:
+                row = values[min(int(at / rate * shown.rate), len(values) - 1)]
+                session.push(name, row[shown.layout.slice(name)], start + at / rate)
         began = time.perf_counter()
         told = session.forecast(0.1, now)
         taken[i] = time.perf_counter() - began

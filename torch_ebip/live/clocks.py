@@ -26,6 +26,8 @@ MOST_HELD = 64
 """Samples that wait for ``now`` to say whether a clock jumped."""
 RECENT = 31
 """Samples over which the usual step and the lateness are taken."""
+SOMETIMES = 8
+"""Samples after which the usual step is looked at again."""
 SLACK = 3.0
 """Usual steps by which samples may lie apart."""
 
@@ -36,6 +38,7 @@ class SensorClock:
 
     Attributes:
         offset: subtracted from its stamps, s.
+        usual: seconds between its samples; 0 before that is known.
         newest: of its stamps that were believed, corrected; minus infinity before the first.
         last: the stamp that arrived last, as it was.
         steps: between successive ones, s.
@@ -53,6 +56,7 @@ class SensorClock:
     """
 
     offset: float = 0.0
+    usual: float = 0.0
     newest: float = -math.inf
     last: float = -math.inf
     steps: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
@@ -68,10 +72,12 @@ class SensorClock:
     jump: float = 0.0
     at: float = math.nan
 
-    @property
-    def usual(self) -> float:
-        """Seconds between its samples; 0 before that is known."""
-        return median(self.steps) if len(self.steps) > 1 else 0.0
+    def step(self, seconds: float) -> None:
+        """It said something so long after the last time."""
+        self.steps.append(seconds)
+        # A median costs as much as all else that is done to a sample: it is not taken anew each time.
+        if len(self.steps) > 1 and (len(self.steps) < SOMETIMES or self.taken % SOMETIMES == 0):
+            self.usual = median(self.steps)
 
     @property
     def lateness(self) -> float:
@@ -109,9 +115,9 @@ class Clocks:
         for clock, delay in zip(self.sensors, self._delays, strict=True):
             clock.newest = clock.last = -math.inf
             clock.held, clock.returning = [], []
-            clock.lags.clear()
             if offsets:
                 clock.offset = delay
+                clock.lags.clear()
 
     def admit(self, sample: Sample) -> list[Sample]:
         """The samples that can be believed now that this one came, on corrected clocks; most often this one alone."""
@@ -162,7 +168,7 @@ class Clocks:
             clock.taken += 1
             if sample.says and sample.time > clock.newest:
                 if clock.newest > -math.inf:
-                    clock.steps.append(sample.time - clock.newest)
+                    clock.step(sample.time - clock.newest)
                 clock.newest = sample.time
                 self._newest = max(self._newest, sample.time)
         return samples

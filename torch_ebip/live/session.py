@@ -22,6 +22,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from torch_ebip.common.ambient import in_own_modes
+from torch_ebip.common.forks import forks
 from torch_ebip.interaction.filters import InteractionFilter
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.live.arrivals import HELP, Arrival, Arrivals, kept
@@ -92,7 +93,7 @@ class InteractionSession:
         self._longest = float(primitive.durations.max())
         self._arrivals = Arrivals()
         self._lock = threading.RLock()
-        self._process, self._closed = os.getpid(), False
+        self._process, self._forks, self._closed = os.getpid(), forks(), False
         self._log: SessionLog | None = None
         if record is not None:
             header = {
@@ -118,7 +119,7 @@ class InteractionSession:
         number = self._numbers.get(sensor)
         if number is None:
             raise ValueError(f"no sensor {sensor!r}; this session has {', '.join(self.sensors)}")
-        if self._closed or os.getpid() != self._process:
+        if self._closed or self._forks != forks():
             self._check()
         moment = time if type(time) is float else as_number(time)
         self._arrivals.put(Arrival(number, kept(values, self._lengths[number]), moment))
@@ -141,7 +142,7 @@ class InteractionSession:
         """Refuse a session that was closed, or that a fork has copied."""
         if self._closed:
             raise RuntimeError("this session was closed; make a new one")
-        if os.getpid() != self._process:
+        if self._forks != forks():
             raise RuntimeError(
                 f"this session belongs to process {self._process}, whose threads and recording a fork does not copy; "
                 "make a new one here"
@@ -261,7 +262,7 @@ class InteractionSession:
 
     def close(self) -> None:
         """Take in what waits, and end the recording, if there is one. Only `report` answers after that."""
-        if os.getpid() != self._process:  # of the parent; who holds the lock there is not here
+        if self._forks != forks():  # of the parent; who holds the lock there is not here
             return
         with self._lock:
             self._closed = True
