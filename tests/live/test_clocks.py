@@ -85,13 +85,13 @@ def test_a_sensor_whose_clock_jumps_alone_is_refused_and_named(told: bool) -> No
     assert "gaze" in session.forecast(0.1).stale
 
 
-def test_a_gap_in_which_now_went_on_is_a_gap() -> None:
-    """The robot's clock tells it from a jump: nothing is noted, and nothing refused."""
+@pytest.mark.parametrize("apart", [0.0, -1.0, 0.2])
+def test_a_gap_in_which_now_went_on_is_a_gap(apart: float) -> None:
+    """The robot's clock tells it from a jump, also where it is another one: nothing is noted, and nothing refused."""
     session = live()
     for sensor, value, moment in samples():
         later = moment + 0.5 * (moment > 12.5 * DT)
-        if later > moment:
-            session.advance(EPOCH + later)
+        session.advance(EPOCH + later + apart)
         session.push(sensor, value, EPOCH + later)
     report = session.report()
     assert report["hand"].accepted == 25

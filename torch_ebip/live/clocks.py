@@ -40,6 +40,7 @@ class SensorClock:
         offset: subtracted from its stamps, s.
         usual: seconds between its samples; 0 before that is known.
         newest: of its stamps that were believed, corrected; minus infinity before the first.
+        told: what the robot had said last that time was by then, s.
         last: the stamp that arrived last, as it was.
         steps: between successive ones, s.
         lags: how long before the newest of all it was, on arrival, s.
@@ -58,6 +59,7 @@ class SensorClock:
     offset: float = 0.0
     usual: float = 0.0
     newest: float = -math.inf
+    told: float = -math.inf
     last: float = -math.inf
     steps: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
     lags: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
@@ -113,7 +115,7 @@ class Clocks:
         """What comes next may be stamped anything; with ``offsets``, clocks are taken as they are again."""
         self._newest = self._told = -math.inf
         for clock, delay in zip(self.sensors, self._delays, strict=True):
-            clock.newest = clock.last = -math.inf
+            clock.newest = clock.last = clock.told = -math.inf
             clock.held, clock.returning = [], []
             if offsets:
                 clock.offset = delay
@@ -159,6 +161,8 @@ class Clocks:
     def _ahead(self, clock: SensorClock) -> float:
         """The latest stamp that nobody needs to bear out."""
         present = self._present
+        if clock.told > -math.inf:  # the robot's clock may be another one: it is how far it went on that counts
+            present = max(present, clock.newest + self._told - clock.told)
         return math.inf if present == -math.inf else present + max(self._reach, SLACK * clock.usual)
 
     def _believe(self, clock: SensorClock, samples: list[Sample]) -> list[Sample]:
@@ -169,7 +173,7 @@ class Clocks:
             if sample.says and sample.time > clock.newest:
                 if clock.newest > -math.inf:
                     clock.step(sample.time - clock.newest)
-                clock.newest = sample.time
+                clock.newest, clock.told = sample.time, self._told
                 self._newest = max(self._newest, sample.time)
         return samples
 
