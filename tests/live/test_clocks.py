@@ -49,7 +49,11 @@ def test_a_jump_of_all_clocks_is_named(size: float) -> None:
     assert report["hand"].jumps == 1
     assert report["hand"].jumped == pytest.approx(size, abs=DT)
     assert any(f"hand: its clock jumped once, by {size:+.2f} s" in note for note in report.notes)
-    assert pushed(live(), jumping(size), polled=True).forecast().notes == report.notes
+    session = pushed(live(), jumping(size), polled=True)
+    assert session.forecast().notes == report.notes
+    session.restart()
+    assert session.report()["hand"].jumps == session.report()["hand"].backwards == 0
+    assert not session.report().notes
 
 
 @pytest.mark.parametrize("size", [2.0, -0.5])

@@ -117,6 +117,7 @@ class Clocks:
         for clock, delay in zip(self.sensors, self._delays, strict=True):
             clock.newest = clock.last = clock.told = -math.inf
             clock.held, clock.returning = [], []
+            clock.backwards = clock.jumps = 0
             if offsets:
                 clock.offset = delay
                 clock.lags.clear()

@@ -39,16 +39,15 @@ class Opening:
         self.pushes: deque[Sample] = deque(maxlen=MOST)
         self._first = math.nan
 
-    def add(self, sample: Sample, usable: bool) -> bool:
+    def add(self, sample: Sample) -> bool:
         """Take note of a sample; whether the start is another one now.
 
         Args:
-            sample: with the time when it was taken, s; NaN if that is not known.
-            usable: whether it says anything: the others do not begin an interaction.
+            sample: with the time when it was taken, s; one that says nothing does not begin an interaction.
         """
         self.pushes.append(sample)
         moment = sample.time
-        if not usable:
+        if not sample.says:
             return False
         if self.start is None:
             self.start = self._first = moment

@@ -125,7 +125,7 @@ class Timeline:
         if usable and sample.time <= self._before:  # of the interaction before this one
             self._intake.refuse(sample)
             return
-        if opening.add(sample, usable) and opening.start is not None:
+        if opening.add(sample) and opening.start is not None:
             if waiting:  # what was asked before does not bind the clock of the samples
                 self._now = -math.inf
             self._begin(opening.start)
