@@ -128,8 +128,11 @@ class Intake:
             return Sample(modality, None, moment)
         low, high = self._limits[modality]
         values = vector.tolist()
-        if all(least <= value <= most for least, value, most in zip(low, values, high, strict=True)):
-            return Sample(modality, vector, moment, says=True)
+        for least, value, most in zip(low, values, high, strict=True):
+            if not least <= value <= most:
+                break
+        else:
+            return Sample(modality, vector, moment, True)
         missing = infinite = outside = impossible = says = False
         for i, value in enumerate(values):
             if low[i] <= value <= high[i]:

@@ -201,7 +201,7 @@ class InteractionSession:
             self._take_in()
             self._timeline.advance(now)
             timeline = self._timeline
-            left = timeline.time_to_end()
+            left = timeline.place.time_to_end
             if rate is not None:
                 end = min(left, self._longest)
                 horizons, several, horizon = sampled(horizons[0] if horizons else end, rate), True, 0.0
@@ -212,7 +212,7 @@ class InteractionSession:
                 self._log.write(["forecast", now, asked, mean.tolist()])
             if not several:
                 mean, deviation = mean[0], deviation[0]
-            phase = timeline.place()
+            phase = timeline.place.within
             now, stale = timeline.now, tuple(self.sensors[i] for i in timeline.stale())
             return SessionForecast(
                 now, phase, left, self.dofs, mean, deviation, stale, tuple(horizons),

@@ -17,6 +17,7 @@ from torch_ebip.live.engine import make_engine
 from torch_ebip.live.intake import Array, Intake, Sample, training_ranges
 from torch_ebip.live.notes import notes
 from torch_ebip.live.opening import Lost, Opening, Units
+from torch_ebip.live.place import Place
 from torch_ebip.live.report import SessionReport
 from torch_ebip.live.settings import SessionSettings, delays_of, patience_of
 from torch_ebip.live.track import REPEATS, Track
@@ -63,6 +64,7 @@ class Timeline:
         delays = delays_of(settings.delays, sensors)
         self._clocks = Clocks(dt, settings.window, settings.correct_clocks, delays)
         self._before = -math.inf
+        self._place: Place | None = None
         self._open(settings.start)
 
     def restart(self, start: float | str) -> None:
@@ -178,37 +180,21 @@ class Timeline:
         self._now = max(self._now, self._start, self._newest if now is None else now)
         newest = math.floor((self._now - self.settings.settle - self._start) / self.dt + TOLERANCE)
         self._track.advance(newest, whole=self._now == before)
+        self._place = None
         if self.finished and self._over is None:
             self._over = self._now
 
-    def phase_now(self) -> tuple[float, float]:
-        """Phase and its velocity, 1/s, at the present: since the last tick the interaction went on."""
-        phase, velocity = self._engine.clock()
-        waits, since = self._engine.waits(), self._since()
-        gone = since if waits is None else float(waits.gone(self._like.new_tensor([since])))
-        return phase + velocity * gone, velocity
-
-    def place(self) -> float:
-        """The phase within 0 and 1."""
-        phase, _ = self.phase_now()
-        return phase % 1.0 if self._periodic else min(max(phase, 0.0), 1.0)
-
-    def time_to_end(self) -> float:
-        """Seconds until phase 1, of who stands still until they go on, too; infinite where there is no end."""
-        _, velocity = self.phase_now()
-        if self._periodic or velocity <= 0:
-            return math.inf
-        waits = self._engine.waits()
-        rest = 0.0 if waits is None else float(waits.rest)
-        return (1 - self.place()) / velocity + rest
+    @property
+    def place(self) -> Place:
+        """Where the interaction is at the present: since the last tick it went on."""
+        if self._place is None:
+            self._place = Place.of(self._engine, self._since(), self._periodic)
+        return self._place
 
     @property
     def finished(self) -> bool:
-        """Whether the interaction is over: nearer to its end than half a tick. What repeats never is."""
-        if self._periodic or self.waiting:
-            return False
-        _, velocity = self.phase_now()
-        return self.place() >= 1 - max(velocity, 0.0) * self.dt / 2
+        """Whether the interaction is over."""
+        return not self.waiting and self.place.finished(self.dt)
 
     def forecast(self, horizons: Sequence[float]) -> Forecast:
         """Of the controlled DoFs so many seconds ahead of the present; infinity: the end.
@@ -216,15 +202,9 @@ class Timeline:
         Of a person who may stand still, and on a circle, seconds are asked for: how far they will get is not one
         phase.
         """
-        waits = self._engine.waits()
-        if (waits is not None or self._periodic) and min(horizons) >= 0:
+        if (self.place.waits is not None or self._periodic) and min(horizons) >= 0:
             return self._engine.forecast_ahead(self._like.new_tensor(horizons) + self._since())
-        phase, velocity = self.phase_now()
-        gone = horizons if waits is None else waits.gone(self._like.new_tensor(horizons)).tolist()
-        ahead = [1.0 if math.isinf(seconds) else phase + velocity * seconds for seconds in gone]
-        return self._engine.forecast(
-            self._like.new_tensor(ahead if self._periodic else [min(max(at, 0.0), 1.0) for at in ahead])
-        )
+        return self._engine.forecast(self._like.new_tensor(self.place.ahead(horizons)))
 
     def _since(self) -> float:
         """How long ago the last tick was, s."""
@@ -268,6 +248,7 @@ class Timeline:
         self._start = start
         self._intake = Intake(self._columns, self._ranges, start, self.dt, *self._reach)
         self._track.begin(self._intake)
+        self._place = None
 
     def _take(self, sample: Sample) -> None:
         """Store a sample in its tick."""

@@ -52,19 +52,20 @@ class BSplineBasis(Basis):
     def evaluate(self, phase: Tensor) -> tuple[Tensor, Tensor]:
         """Values and slopes, from the polynomial pieces; see `Basis.evaluate`."""
         coefficients, local = self._pieces_at(phase)
-        values, slopes = coefficients[..., -1, :], None
-        for k in range(self.degree - 1, -1, -1):  # Horner's scheme, for the value and its derivative
-            slopes = values if slopes is None else slopes * local + values
-            values = values * local + coefficients[..., k, :]
+        *rest, values = coefficients.unbind(-2)
+        slopes = None
+        for coefficient in reversed(rest):  # Horner's scheme, for the value and its derivative
+            slopes = values if slopes is None else torch.addcmul(values, slopes, local)
+            values = torch.addcmul(coefficient, values, local)
         slopes = torch.zeros_like(values) if slopes is None else slopes
         return values, slopes * len(self.pieces)
 
     def within(self, phase: Tensor) -> Tensor:
         """See `Basis.within`: without the slopes."""
         coefficients, local = self._pieces_at(phase)
-        values = coefficients[..., -1, :]
-        for k in range(self.degree - 1, -1, -1):
-            values = values * local + coefficients[..., k, :]
+        *rest, values = coefficients.unbind(-2)
+        for coefficient in reversed(rest):
+            values = torch.addcmul(coefficient, values, local)
         return values
 
     def _pieces_at(self, phase: Tensor) -> tuple[Tensor, Tensor]:
