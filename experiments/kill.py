@@ -99,11 +99,12 @@ class Campaign:
         folder: to work in.
         seed: of the recording, and of the moments.
         steps: gradient steps of a run.
+        interactions: in the recording.
     """
 
-    def __init__(self, folder: Path, seed: int, steps: int) -> None:
+    def __init__(self, folder: Path, seed: int, steps: int, interactions: int) -> None:
         self.folder, self.random = folder, random.Random(seed)
-        recording(seed).save(folder / "recording.npz")
+        recording(seed, interactions).save(folder / "recording.npz")
         self.line = [sys.executable, "-m", "experiments.tune", "--data", str(folder / "recording.npz"), "--quick"]
         self.line += ["--steps", str(steps), "--seed", str(seed)]
         self.reference = folder / "undisturbed"
@@ -167,13 +168,13 @@ def main(arguments: list[str] | None = None) -> None:
     if kills < 1 or options.steps < 1:
         raise SystemExit("needs --kills and --steps of at least 1")
     began = time.monotonic()
-    settings = {"kills": kills, "steps": options.steps, "seed": options.seed}
+    settings = {"kills": kills, "steps": options.steps, "interactions": options.interactions, "seed": options.seed}
     run = RunFolder("kill", settings, options.out, options.force, arguments)
     with (
         tempfile.TemporaryDirectory() as folder,
         tqdm(total=kills, desc="kills", unit="kill", dynamic_ncols=True) as bar,
     ):
-        campaign = Campaign(Path(folder), options.seed, options.steps)
+        campaign = Campaign(Path(folder), options.seed, options.steps, options.interactions)
         campaign.run(kills, bar)
     results = {
         "experiment": "kill",
@@ -213,6 +214,7 @@ def _parser() -> Any:
     parser = experiment_parser("kill", __doc__)
     parser.add_argument("--kills", type=int, default=100, help="how many (default: 100)")
     parser.add_argument("--steps", type=int, default=20, help="gradient steps of a run (default: 20)")
+    parser.add_argument("--interactions", type=int, default=24, help="in the recording (default: 24)")
     add_run_options(parser, "kill", "the recording and of the moments", "three kills", resumes=False)
     return parser
 

@@ -36,7 +36,7 @@ def can_mount() -> bool:
 def command(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """A small tuning run."""
     file = tmp_path_factory.mktemp("data") / "recording.npz"
-    recording(0).save(file)
+    recording(0, 12).save(file)
     return [sys.executable, "-m", "experiments.tune", "--data", str(file), "--quick", "--steps", "8"]
 
 

@@ -20,7 +20,7 @@ from torch_ebip.common.draws import seeded
 
 
 def test_the_command_at_a_small_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    interactions(40).save(tmp_path / "made.npz")
+    interactions(20).save(tmp_path / "made.npz")
     run = ["--data", str(tmp_path / "made.npz"), "--quick", "--methods", "ebip_tuned", "ebip", "--workers", "1"]
     main([*run, "--out", str(tmp_path / "run")])
     results = json.loads((tmp_path / "run" / "results.json").read_text())

@@ -18,7 +18,7 @@ from torch_ebip.learning.model_file import write_model_file
 
 
 def test_a_killed_run_ends_in_the_same_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    main(["--kills", "2", "--steps", "4", "--seed", "2", "--out", str(tmp_path / "run")])
+    main(["--kills", "2", "--steps", "4", "--interactions", "12", "--seed", "2", "--out", str(tmp_path / "run")])
     results = json.loads((tmp_path / "run" / "results.json").read_text())
     assert results["kills"] == sum(results["kills_by_stage"].values()) == 2
     assert results["runs_finished"] >= 1

@@ -281,7 +281,7 @@ def interruptible():
 
 @pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize("stage", ["factor", "gradient", "read-out", "surprise"])
-def test_an_interrupt_keeps_the_best_so_far(stage: str, tmp_path: Path) -> None:
+def test_an_interrupt_keeps_the_best_so_far(stage: str, model, tmp_path: Path) -> None:
     """A signal as Ctrl-C sends it, in the middle of a stage; the folder then goes on to what a whole run gives."""
     known = interactions(20)
     sent = []
@@ -293,15 +293,15 @@ def test_an_interrupt_keeps_the_best_so_far(stage: str, tmp_path: Path) -> None:
             time.sleep(0.05)
 
     assert threading.current_thread() is threading.main_thread()
-    model = learn(known, folder=tmp_path, progress=stop, **QUICK)
+    stopped = learn(known, folder=tmp_path, progress=stop, **QUICK)
     assert sent
-    assert model.report["interrupted"]
-    assert "interrupted, this is the best so far" in model.report.verdict
-    assert model.forecast(known[0], [0.3]).mean.isfinite().all()
+    assert stopped.report["interrupted"]
+    assert "interrupted, this is the best so far" in stopped.report.verdict
+    assert stopped.forecast(known[0], [0.3]).mean.isfinite().all()
     assert not (tmp_path / "model.safetensors").exists()
-    whole, resumed = learn(known, **QUICK), learn(known, folder=tmp_path, **QUICK)
+    resumed = learn(known, folder=tmp_path, **QUICK)
     assert not resumed.report["interrupted"]
-    assert torch.allclose(whole.forecast(known[0], [0.3]).mean, resumed.forecast(known[0], [0.3]).mean)
+    assert torch.allclose(model.forecast(known[0], [0.3]).mean, resumed.forecast(known[0], [0.3]).mean)
 
 
 def test_an_arm_is_part_of_what_is_minimised() -> None:
