@@ -95,7 +95,7 @@ def slow(sample: Sample, scene: Scene) -> Sample:
 
 def one_ahead(sample: Sample, scene: Scene) -> Sample:
     """The first sample of each sensor after half of the time is stamped two seconds ahead."""
-    bad = 0 <= sample.taken - scene.half < scene.step
+    bad = -1e-9 <= sample.taken - scene.half < scene.step - 1e-9
     return sample._replace(stamp=sample.stamp + 2) if bad else sample
 
 
