@@ -80,8 +80,10 @@ def figure(rows: Sequence[Mapping[str, Any]], long: Mapping[str, Any] | None) ->
     ratios = [of["ratio"] if of["ratio"] is not None else np.nan for of in rows]
     left.barh(heights, ratios, color=[VERDICTS[of["verdict"]] for of in rows], height=0.7)
     left.axvline(HANDLED, c="0.4", ls=":", lw=1)
-    left.set_xscale("log")
-    left.set_xlim(0.5, max(4.0, 1.2 * np.nanmax(ratios)))
+    for height, ratio in zip(heights, ratios, strict=True):
+        if np.isnan(ratio):
+            left.text(0.02, height, "refused, with a reason", va="center", fontsize=7)
+    left.set_xlim(0, max(2.0, 1.1 * np.nanmax(ratios)))
     left.set_yticks(heights, [of["case"] for of in rows], fontsize=7)
     left.set_xlabel(f"error {HORIZON:g} s ahead over that of the undisturbed [1]; dotted: {HANDLED:g}")
     used = [name for name in VERDICTS if any(of["verdict"] == name for of in rows)]
