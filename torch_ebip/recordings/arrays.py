@@ -33,12 +33,14 @@ MOST = 100_000
 
 
 class Recordings(NamedTuple):
-    """What a file holds: layout, one of the trajectories [T_i, D] a demonstration, rate in Hz, extra columns [N]."""
+    """What a file holds: layout, one of the trajectories [T_i, D] a demonstration, rate in Hz, extra columns [N], and
+    what was wrong with it, in sentences."""
 
     layout: Layout
     trajectories: list[Array]
     rate: float
     columns: dict[str, Array]
+    remarks: tuple[str, ...] = ()
 
 
 def write_npz(path: str | os.PathLike[str], recordings: Recordings) -> None:
@@ -50,7 +52,7 @@ def write_npz(path: str | os.PathLike[str], recordings: Recordings) -> None:
     """
     layout = recordings.layout
     arrays: dict[str, Array] = {
-        "values": np.concatenate(recordings.trajectories).astype(np.float32),
+        "values": _as_saved(np.concatenate(recordings.trajectories)),
         "lengths": np.array([len(trajectory) for trajectory in recordings.trajectories], dtype=np.int64),
         "rate": np.float64(recordings.rate),  # type: ignore[dict-item]
         "dofs": np.array(layout.dofs),
@@ -79,6 +81,11 @@ def write_npz(path: str | os.PathLike[str], recordings: Recordings) -> None:
             file.seek(0)
             file.truncate()
             _write_arrays(file, arrays, zipfile.ZIP_STORED)
+
+
+def _as_saved(values: Array) -> Array:
+    """In double precision if it came so, otherwise in single."""
+    return values.astype(np.float64 if values.dtype == np.float64 else np.float32, copy=False)
 
 
 def _write_arrays(file: IO[bytes], arrays: Mapping[str, Array], method: int) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
@@ -16,6 +17,8 @@ from torch_ebip.common.arguments import as_count, as_indices, as_number, as_valu
 from torch_ebip.recordings.arrays import LIMIT, Array, Recordings, read_npz, write_npz
 from torch_ebip.recordings.folders import CSV_LIMIT, read_folder
 from torch_ebip.recordings.layout import Layout, Modality
+from torch_ebip.recordings.resampling import How
+from torch_ebip.recordings.streams import Interaction, gridded
 
 
 class Demonstrations:
@@ -29,10 +32,17 @@ class Demonstrations:
         rate: samples a second, Hz.
         columns: further facts, one row a demonstration (release times, names), kept under their names.
         labels: which interaction each demonstration shows, N names; kept as the column ``labels``.
+        remarks: sentences about what was wrong with them, of who read them; `report` shows them, files do not keep
+            them.
+
+    Attributes:
+        layout: in SI units: values in others that a factor converts (``"mm"``, ``"deg"``, ``"cm/s^2"``; ``"g"`` is
+            the standard gravity) are converted.
 
     Raises:
         ValueError: no demonstration; a trajectory that is not [T >= 2, D], has no measured value or an
-            infinite one; a rate that is not a positive number; a column without N rows; labels that are not N names.
+            infinite one; a rate that is not a positive number; a column without N rows; labels that are not N names;
+            a unit that is not SI and that no factor converts, such as ``"degC"``.
     """
 
     def __init__(
@@ -42,13 +52,16 @@ class Demonstrations:
         rate: float,
         columns: Mapping[str, Array] | None = None,
         labels: Sequence[str] | None = None,
+        remarks: Sequence[str] = (),
     ) -> None:
         rate = as_number("rate", rate, 0, above=True, of="of samples a second")
         if len(trajectories) == 0:
             raise ValueError("at least one demonstration is needed, got none")
-        self.layout = layout
+        self.layout, factors = layout.in_si()
         self.rate = rate
-        self.trajectories = tuple(_checked(i, trajectory, layout) for i, trajectory in enumerate(trajectories))
+        checked = (_checked(i, trajectory, layout) for i, trajectory in enumerate(trajectories))
+        self.trajectories = tuple(each if factors is None else each * factors.to(each) for each in checked)
+        self.remarks = tuple(remarks)
         if len({(trajectory.dtype, trajectory.device) for trajectory in self.trajectories}) > 1:
             raise ValueError("all trajectories must have one dtype and live on one device")
         self.columns = {name: np.asarray(column) for name, column in (columns or {}).items()}
@@ -104,7 +117,7 @@ class Demonstrations:
             ValueError: labels that are not N names.
         """
         others = {name: column for name, column in self.columns.items() if name != "labels"}
-        return Demonstrations(self.layout, self.trajectories, self.rate, others, labels)
+        return Demonstrations(self.layout, self.trajectories, self.rate, others, labels, self.remarks)
 
     def assign(self, targets: Sequence[str] | None = None, sensors: Sequence[str] | None = None) -> Demonstrations:
         """The same recordings with other roles: what is forecast is controlled, what is shown is not.
@@ -141,7 +154,7 @@ class Demonstrations:
             return self
         dofs = layout.mask(assigned.names)
         parts = [trajectory[:, dofs] for trajectory in self.trajectories]
-        return Demonstrations(assigned, parts, self.rate, self.columns)
+        return Demonstrations(assigned, parts, self.rate, self.columns, remarks=self.remarks)
 
     def subset(self, indices: Sequence[int] | Sequence[bool] | Tensor) -> Demonstrations:
         """Some of the demonstrations, with their columns.
@@ -154,7 +167,8 @@ class Demonstrations:
         """
         chosen = as_indices("demonstration", indices, len(self)).tolist()
         columns = {name: column[chosen] for name, column in self.columns.items()}
-        return Demonstrations(self.layout, [self.trajectories[i] for i in chosen], self.rate, columns)
+        trajectories = [self.trajectories[i] for i in chosen]
+        return Demonstrations(self.layout, trajectories, self.rate, columns, remarks=self.remarks)
 
     def folds(self, k: int, generator: torch.Generator | None = None) -> list[tuple[Tensor, Tensor]]:
         """Shuffle once and cut into k parts: (training, test) indices int64 [M], sizes differing by at most one.
@@ -179,10 +193,10 @@ class Demonstrations:
     def to(self, *, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Demonstrations:
         """The same demonstrations in another dtype or on another device."""
         moved = [trajectory.to(dtype=dtype, device=device) for trajectory in self.trajectories]
-        return Demonstrations(self.layout, moved, self.rate, self.columns)
+        return Demonstrations(self.layout, moved, self.rate, self.columns, remarks=self.remarks)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write one ``.npz`` (values in float32, never pickled), which `load` reads; atomic.
+        """Write one ``.npz`` (values in their own precision, never pickled), which `load` reads; atomic.
 
         Raises:
             ValueError: see `recordings.write_npz`.
@@ -204,10 +218,57 @@ class Demonstrations:
         return cls._from_recordings(path, read_folder(path, limit))
 
     @classmethod
+    def from_streams(
+        cls,
+        layout: Layout,
+        interactions: Sequence[Interaction],
+        rate: float | None = None,
+        max_gap: float | None = None,
+        *,
+        how: How | Mapping[str, How] = "linear",
+        span: str | Sequence[tuple[float, float]] | None = None,
+        columns: Mapping[str, Array] | None = None,
+        labels: Sequence[str] | None = None,
+    ) -> Demonstrations:
+        """Sensors that have times of their own, put onto one even grid.
+
+        Stamps that run backwards are sorted, of those that repeat the first is kept; `remarks` counts both, and a
+        warning shows them.
+
+        Args:
+            layout: of all modalities; one that an interaction lacks was not measured there.
+            interactions: N of {modality: (times [T] in s, values [T, d] in the layout's units)}; NaN: not measured.
+                Values in single precision stay so, all others are kept in double precision.
+            rate: samples a second of the grid, Hz; default: that of the fastest sensor, by its usual step.
+            max_gap: s, up to which apart samples are joined; NaN between those that are further. Default: three of
+                the sensor's own usual steps.
+            how: for all, or by modality: ``"linear"`` between samples, the ``"nearest"`` one at most ``max_gap``
+                away, or each ``"sample"`` where it is nearest to and NaN elsewhere.
+            span: from where to where: the name of a modality, or N pairs (start, end) in s; default: the time that
+                all sensors of an interaction cover.
+            columns, labels: see `Demonstrations`.
+
+        Raises:
+            ValueError: times and values that do not go together, stamps that are not finite, more than a third of a
+                stream's backwards or repeated; sensors without a common time; a modality that the layout lacks.
+
+        Example:
+            >>> import numpy as np
+            >>> layout = Layout([Modality("hand", ["x"], "m"), Modality("arm", ["q"], "rad", controlled=True)])
+            >>> hand, arm = np.arange(0, 1, 0.02), np.arange(0, 1, 0.1)
+            >>> Demonstrations.from_streams(layout, [{"hand": (hand, hand), "arm": (arm, arm)}])
+            Demonstrations(1 of 46 to 46 samples at 50 Hz, 2 DoFs: hand, arm)
+        """
+        made = gridded(layout, interactions, rate, max_gap, how, span)
+        if made.remarks:
+            warnings.warn("; ".join(made.remarks), stacklevel=2)
+        return cls(layout, made.trajectories, made.rate, columns, labels, made.remarks)
+
+    @classmethod
     def _from_recordings(cls, path: str | os.PathLike[str], recordings: Recordings) -> Demonstrations:
         tensors = [torch.from_numpy(np.ascontiguousarray(array)) for array in recordings.trajectories]
         try:
-            return cls(recordings.layout, tensors, recordings.rate, recordings.columns)
+            return cls(recordings.layout, tensors, recordings.rate, recordings.columns, remarks=recordings.remarks)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
 

@@ -10,6 +10,8 @@ from itertools import accumulate
 import torch
 from torch import Tensor
 
+from torch_ebip.recordings.units import in_si
+
 
 @dataclass(frozen=True, init=False)
 class Modality:
@@ -116,6 +118,20 @@ class Layout:
     def modality_of_dof(self) -> Tensor:
         """int64 [D]: index into `modalities` of each DoF."""
         return torch.tensor([i for i, modality in enumerate(self.modalities) for _ in modality.dofs], device="cpu")
+
+    def in_si(self) -> tuple[Layout, Tensor | None]:
+        """The same in SI units, and by what the values of each DoF are multiplied for that, [D]; None if by nothing.
+
+        Raises:
+            ValueError: a unit that is not SI and that no factor converts.
+        """
+        found = [in_si(modality.unit) for modality in self.modalities]
+        if all(factor == 1 for _, factor in found):
+            return self, None
+        pairs = list(zip(self.modalities, found, strict=True))
+        factors = [factor for modality, (_, factor) in pairs for _ in modality.dofs]
+        parts = [Modality(m.name, m.dofs, unit, m.controlled) for m, (unit, _) in pairs]
+        return Layout(parts), torch.tensor(factors, dtype=torch.float64, device="cpu")
 
     def __getitem__(self, name: str) -> Modality:
         """The modality of that name; ValueError if there is none."""
