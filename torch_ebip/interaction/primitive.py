@@ -17,6 +17,7 @@ from torch_ebip.interaction.basis.selection import select_basis
 from torch_ebip.interaction.basis.stacked import StackedBasis
 from torch_ebip.interaction.course import turn_between
 from torch_ebip.recordings.demonstrations import Demonstrations
+from torch_ebip.recordings.jumps import warn_of_cut_turns
 from torch_ebip.recordings.layout import Layout
 from torch_ebip.recordings.repeats import longest_repeats
 
@@ -123,6 +124,7 @@ class InteractionPrimitive(Meaning):
         if periodic and not basis.periodic:
             raise ValueError("interactions that repeat need a periodic basis, such as PeriodicBSplineBasis")
         layout = demonstrations.layout
+        warn_of_cut_turns(layout, demonstrations.trajectories)
         if basis.n_dofs != layout.n_dofs:
             raise ValueError(f"the basis is for {basis.n_dofs} DoFs, the demonstrations have {layout.n_dofs}")
         largest = max(part.n_features for part in basis.bases)

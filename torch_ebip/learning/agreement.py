@@ -20,6 +20,8 @@ def check_agreement(demonstrations: Demonstrations, layout: Layout, rate: float)
         raise ValueError(f"the recordings lack {', '.join(missing)}; they have {', '.join(theirs.names)}")
     for mine in layout.modalities:
         other = theirs[mine.name]
+        if other.kind != mine.kind:
+            raise ValueError(f"{mine.name} is of kind {other.kind!r} in the recordings, {mine.kind!r} in the model")
         if other.unit != mine.unit:
             raise ValueError(f"{mine.name} is in {other.unit!r} in the recordings, in {mine.unit!r} in the model")
         if other.dofs != mine.dofs:

@@ -73,13 +73,18 @@ Description = dict[str, Any]
 def describe_layout(layout: Layout) -> list[Description]:
     """A layout's modalities in order, in plain values."""
     return [
-        {"name": m.name, "dofs": list(m.dofs), "unit": m.unit, "controlled": m.controlled} for m in layout.modalities
+        {"name": m.name, "dofs": list(m.dofs), "unit": m.unit, "controlled": m.controlled}
+        | ({} if m.kind == "plain" else {"kind": m.kind, "centre": m.centre and list(m.centre)})
+        for m in layout.modalities
     ]
 
 
 def layout_of(description: Sequence[Description]) -> Layout:
     """The layout that `describe_layout` described."""
-    return Layout([Modality(m["name"], m["dofs"], m["unit"], m["controlled"]) for m in description])
+    return Layout([
+        Modality(m["name"], m["dofs"], m["unit"], m["controlled"], m.get("kind", "plain"), m.get("centre"))
+        for m in description
+    ])  # fmt: skip
 
 
 def describe_basis(basis: Basis) -> Description:

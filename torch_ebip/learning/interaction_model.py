@@ -222,7 +222,12 @@ class InteractionModel:
             ValueError: a modality that is missing, or has other DoFs, another order or another unit; another rate.
         """
         check_agreement(demonstrations, self.layout, self.rate)
-        return demonstrations.assign(self.targets, self.sensors)
+        assigned = demonstrations.assign(self.targets, self.sensors)
+        if not bool(self.layout.angles.any()):
+            return assigned
+        # Within half a turn of where those that were learned from are.
+        parts = (assigned.trajectories, assigned.rate, assigned.columns)
+        return Demonstrations(self.layout, *parts, remarks=assigned.remarks)
 
     def extend(self, demonstrations: Demonstrations) -> InteractionModel:
         """A model with more members: the same basis and noise, nothing is tuned again.

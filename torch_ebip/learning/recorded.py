@@ -39,6 +39,7 @@ def forecast_recorded(
             f"values must be [T, {layout.n_dofs}], one column for each of {', '.join(layout.dofs[:8])}, "
             f"got {list(y.shape)}; `InteractionModel.prepare` gives recordings the model's columns"
         )
+    y = layout.continuous(y)
     ahead = [ahead] if isinstance(ahead, int | float) else list(ahead)
     if len(ahead) == 0:
         raise ValueError("ahead must be at least one number of seconds")

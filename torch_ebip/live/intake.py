@@ -13,15 +13,17 @@ import numpy.typing as npt
 from torch_ebip.interaction.bounds import demonstrated_range
 from torch_ebip.interaction.primitive import InteractionPrimitive
 from torch_ebip.live.report import SensorReport
+from torch_ebip.recordings.angles import TURN
 
 Array = npt.NDArray[np.float64]
 
 
 class Ranges(NamedTuple):
-    """What a DoF may say, [D] each, units of the DoFs."""
+    """What a DoF may say, [D] each, units of the DoFs, and whether it is an angle, bool [D]: None if none is."""
 
     low: Array
     high: Array
+    angles: npt.NDArray[np.bool_] | None = None
 
 
 def training_ranges(primitive: InteractionPrimitive, margin: float) -> Ranges:
@@ -32,7 +34,8 @@ def training_ranges(primitive: InteractionPrimitive, margin: float) -> Ranges:
     least, most = demonstrated_range(primitive)
     noise = 5 * primitive.residual_variance.sqrt()
     low, high = ((value.double().cpu().numpy()) for value in (least - noise, most + noise))
-    return Ranges(low - margin * (high - low), high + margin * (high - low))
+    angles = primitive.layout.angles.numpy()
+    return Ranges(low - margin * (high - low), high + margin * (high - low), angles if angles.any() else None)
 
 
 class Sample(NamedTuple):
@@ -112,6 +115,8 @@ class Intake:
         self.reports = [SensorReport() for _ in columns]
         self._newest = [(-math.inf, False)] * len(columns)
         self._limits = [(ranges.low[part].tolist(), ranges.high[part].tolist()) for part in columns]
+        # An angle is taken within half a turn of the middle of what was demonstrated, wherever it was wrapped.
+        self._turns = [_turns(ranges, part) for part in columns]
         D = len(ranges.low)
         self._ring = [_Slot(np.full(D, np.nan)) for _ in range(behind + ahead + 2)]
         self._nothing = np.full(D, np.nan)
@@ -127,6 +132,9 @@ class Intake:
         if vector is None or not math.isfinite(moment):
             return Sample(modality, None, moment)
         low, high = self._limits[modality]
+        turns = self._turns[modality]
+        if turns is not None:
+            vector = vector - np.nan_to_num(np.round((vector - turns) / TURN), posinf=0, neginf=0) * TURN
         values = vector.tolist()
         for least, value, most in zip(low, values, high, strict=True):
             if not least <= value <= most:
@@ -258,6 +266,13 @@ class Intake:
             slot.values.fill(np.nan)
             slot.taken.clear()
         return slot
+
+
+def _turns(ranges: Ranges, part: slice) -> Array | None:
+    """Middles of the ranges of angles, rad, NaN for what is none; None if none of these DoFs is."""
+    if ranges.angles is None or not ranges.angles[part].any():
+        return None
+    return np.where(ranges.angles[part], (ranges.low[part] + ranges.high[part]) / 2, np.nan)
 
 
 def as_vector(values: Any, length: int) -> Array | None:

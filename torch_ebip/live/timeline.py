@@ -6,6 +6,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+import torch
+
 from torch_ebip.common.modules import sharing
 from torch_ebip.interaction.bounds import Bounds
 from torch_ebip.interaction.filters import InteractionFilter
@@ -21,6 +23,7 @@ from torch_ebip.live.place import Place
 from torch_ebip.live.report import SessionReport
 from torch_ebip.live.settings import SessionSettings, delays_of, patience_of
 from torch_ebip.live.track import REPEATS, Track
+from torch_ebip.recordings.angles import wrapped
 
 TOLERANCE = 1e-3
 """Ticks by which a time may be short of a tick and still be it: clocks that count from 1970 round to microseconds."""
@@ -60,6 +63,8 @@ class Timeline:
         self._like = next(filter.parameters())
         self._track = Track(self._engine, slots, patience_of(settings.frozen_after, primitive, sensors), self._like)
         self._periodic = primitive.periodic
+        angles = layout.angles[layout.controlled].to(self._like.device)
+        self._angles = angles if bool(angles.any()) else None
         self._units = Units(dt, float(primitive.durations.max()), len(sensors))
         delays = delays_of(settings.delays, sensors)
         self._clocks = Clocks(dt, settings.window, settings.correct_clocks, delays)
@@ -199,12 +204,16 @@ class Timeline:
     def forecast(self, horizons: Sequence[float]) -> Forecast:
         """Of the controlled DoFs so many seconds ahead of the present; infinity: the end.
 
-        Of a person who may stand still, and on a circle, seconds are asked for: how far they will get is not one
-        phase.
+        Angles are in (-pi, pi]. Of a person who may stand still, and on a circle, seconds are asked for: how far they
+        will get is not one phase.
         """
         if (self.place.waits is not None or self._periodic) and min(horizons) >= 0:
-            return self._engine.forecast_ahead(self._like.new_tensor(horizons) + self._since())
-        return self._engine.forecast(self._like.new_tensor(self.place.ahead(horizons)))
+            said = self._engine.forecast_ahead(self._like.new_tensor(horizons) + self._since())
+        else:
+            said = self._engine.forecast(self._like.new_tensor(self.place.ahead(horizons)))
+        if self._angles is None:
+            return said
+        return said._replace(mean=torch.where(self._angles, wrapped(said.mean), said.mean))
 
     def _since(self) -> float:
         """How long ago the last tick was, s."""

@@ -19,6 +19,8 @@ from torch_ebip.recordings.layout import Layout, Modality
 
 Array = npt.NDArray[Any]
 _REQUIRED = ("values", "lengths", "rate", "dofs", "modality", "unit", "controlled")
+_OPTIONAL = {"dof_kind": "U", "dof_centre": "f"}
+"""Of recordings that have angles: the kind of each DoF, and its centre, rad, NaN if it has none."""
 LIMIT = 1 << 34
 """Bytes that a recording may have, unless a caller says something else; no larger one is written."""
 DENSE = 1 << 28
@@ -60,8 +62,12 @@ def write_npz(path: str | os.PathLike[str], recordings: Recordings) -> None:
         "unit": np.array(layout.units),
         "controlled": layout.controlled.numpy(),
     }
+    if any(modality.kind != "plain" for modality in layout.modalities):
+        arrays["dof_kind"] = np.array([modality.kind for modality in layout.modalities for _ in modality.dofs])
+        centres = [m.centre or [np.nan] * len(m.dofs) for m in layout.modalities]
+        arrays["dof_centre"] = np.array([angle for centre in centres for angle in centre], dtype=np.float64)
     for name, column in recordings.columns.items():
-        if name in arrays or name == "file":
+        if name in arrays or name in (*_OPTIONAL, "file"):
             raise ValueError(f"column {name!r} has the name of a part of the format; rename it")
         if not isinstance(name, str) or not name.isprintable() or not 0 < len(name) <= LONGEST_NAME:
             raise ValueError(f"column {str(name)[:80]!r}: names must be printable, of 1 to {LONGEST_NAME} characters")
@@ -147,12 +153,13 @@ def _from_arrays(arrays: Mapping[str, Array]) -> Recordings:
         raise ValueError(f"rate must be one number in Hz, got {rate.dtype} {rate.shape}")
     if max(len(lengths), values.shape[1]) > MOST:
         raise ValueError(f"{len(lengths)} demonstrations of {values.shape[1]} DoFs, expected at most {MOST} of each")
-    for name, kind in {"dofs": "U", "modality": "U", "unit": "U", "controlled": "b"}.items():
+    optional = {name: kind for name, kind in _OPTIONAL.items() if name in arrays}
+    for name, kind in {"dofs": "U", "modality": "U", "unit": "U", "controlled": "b", **optional}.items():
         if arrays[name].shape != (values.shape[1],):
             raise ValueError(f"{name} has shape {arrays[name].shape}, expected ({values.shape[1]},), one entry a DoF")
         if arrays[name].dtype.kind != kind:
-            raise ValueError(f"{name} must hold {'strings' if kind == 'U' else 'booleans'}, got {arrays[name].dtype}")
-    columns = {name: array for name, array in arrays.items() if name not in _REQUIRED}
+            raise ValueError(f"{name} must hold {_WORDS[kind]}, got {arrays[name].dtype}")
+    columns = {name: array for name, array in arrays.items() if name not in (*_REQUIRED, *_OPTIONAL)}
     for name, column in columns.items():
         if column.shape[:1] != lengths.shape:
             raise ValueError(
@@ -163,6 +170,21 @@ def _from_arrays(arrays: Mapping[str, Array]) -> Recordings:
     values = values.astype(np.float64 if values.dtype.itemsize == 8 else np.float32, copy=False)
     trajectories = np.split(values, np.cumsum(lengths)[:-1]) if len(lengths) else []
     return Recordings(_layout(arrays), list(trajectories), float(rate), columns)
+
+
+_WORDS = {"U": "strings", "b": "booleans", "f": "numbers"}
+
+
+def _kind_of(name: str, columns: list[int], arrays: Mapping[str, Array]) -> tuple[str, list[float] | None]:
+    """Of a modality, by its columns, and the centre of its angles."""
+    if "dof_kind" not in arrays:
+        return "plain", None
+    kinds = {arrays["dof_kind"].tolist()[i] for i in columns}
+    if len(kinds) != 1:
+        raise ValueError(f"modality {name!r} must be of one kind, got {sorted(kinds)}")
+    kind = kinds.pop()
+    centre = [float(arrays["dof_centre"][i]) for i in columns] if "dof_centre" in arrays else [np.nan]
+    return kind, centre if kind == "angle" and all(map(np.isfinite, centre)) else None
 
 
 def _layout(arrays: Mapping[str, Array]) -> Layout:
@@ -181,5 +203,6 @@ def _layout(arrays: Mapping[str, Array]) -> Layout:
                 f"modality {name!r} must have one unit and one controller, got units "
                 f"{sorted(units)}, controlled {sorted(controllers)}"
             )
-        modalities.append(Modality(name, [dofs[i] for i in columns], units.pop(), controllers.pop()))
+        kind, centre = _kind_of(name, columns, arrays)
+        modalities.append(Modality(name, [dofs[i] for i in columns], units.pop(), controllers.pop(), kind, centre))
     return Layout(modalities)

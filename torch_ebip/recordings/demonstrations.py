@@ -6,6 +6,7 @@ import math
 import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +17,7 @@ from torch_ebip.common.ambient import outside_inference, own_modes
 from torch_ebip.common.arguments import as_count, as_indices, as_number, as_values
 from torch_ebip.recordings.arrays import LIMIT, Array, Recordings, read_npz, write_npz
 from torch_ebip.recordings.folders import CSV_LIMIT, read_folder
-from torch_ebip.recordings.layout import Layout, Modality
+from torch_ebip.recordings.layout import Layout
 from torch_ebip.recordings.resampling import How
 from torch_ebip.recordings.streams import Interaction, gridded
 
@@ -37,7 +38,7 @@ class Demonstrations:
 
     Attributes:
         layout: in SI units: values in others that a factor converts (``"mm"``, ``"deg"``, ``"cm/s^2"``; ``"g"`` is
-            the standard gravity) are converted.
+            the standard gravity) are converted. Angles have their centre, and are continuous.
 
     Raises:
         ValueError: no demonstration; a trajectory that is not [T >= 2, D], has no measured value or an
@@ -57,10 +58,12 @@ class Demonstrations:
         rate = as_number("rate", rate, 0, above=True, of="of samples a second")
         if len(trajectories) == 0:
             raise ValueError("at least one demonstration is needed, got none")
-        self.layout, factors = layout.in_si()
+        in_si, factors = layout.in_si()
         self.rate = rate
         checked = (_checked(i, trajectory, layout) for i, trajectory in enumerate(trajectories))
-        self.trajectories = tuple(each if factors is None else each * factors.to(each) for each in checked)
+        converted = [each if factors is None else each * factors.to(each) for each in checked]
+        self.layout = in_si.centred(converted)
+        self.trajectories = tuple(self.layout.continuous(each) for each in converted)
         self.remarks = tuple(remarks)
         if len({(trajectory.dtype, trajectory.device) for trajectory in self.trajectories}) > 1:
             raise ValueError("all trajectories must have one dtype and live on one device")
@@ -145,7 +148,7 @@ class Demonstrations:
             if not names:
                 raise ValueError(f"no {role}: name some of the modalities {', '.join(layout.names)}")
         kept = [
-            Modality(m.name, m.dofs, m.unit, m.name in targets and m.name not in sensors)
+            replace(m, controlled=m.name in targets and m.name not in sensors)
             for m in layout.modalities
             if m.name in (*targets, *sensors)
         ]
@@ -254,6 +257,7 @@ class Demonstrations:
 
         Example:
             >>> import numpy as np
+            >>> from torch_ebip import Layout, Modality
             >>> layout = Layout([Modality("hand", ["x"], "m"), Modality("arm", ["q"], "rad", controlled=True)])
             >>> hand, arm = np.arange(0, 1, 0.02), np.arange(0, 1, 0.1)
             >>> Demonstrations.from_streams(layout, [{"hand": (hand, hand), "arm": (arm, arm)}])

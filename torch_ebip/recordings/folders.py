@@ -34,7 +34,7 @@ def read_folder(path: str | os.PathLike[str], limit: int = CSV_LIMIT) -> Recordi
     """Read a folder of CSV files, one a demonstration, described by ``layout.toml`` or ``layout.json``.
 
     The description gives ``rate`` (Hz) and a list ``modalities`` of tables with ``name``, ``dofs``, ``unit``
-    and optionally ``controlled``; each CSV file has a header with at least those DoFs (other columns are
+    and optionally ``controlled`` and ``kind``; each CSV file has a header with at least those DoFs (other columns are
     ignored) and a row a sample; an empty cell or ``nan`` was not measured. Files are taken in the order of
     their names, which are kept as the column ``demo_id``. Of delimiters, decimal commas and byte order marks see
     `tables`.
@@ -200,7 +200,8 @@ def _modality(entry: Any) -> Modality:
     if not all(isinstance(dof, str) for dof in dofs):
         raise ValueError("dofs must be a list of names")
     controlled = _entry(entry, "controlled", bool) if "controlled" in entry else False
-    return Modality(_entry(entry, "name", str), dofs, _entry(entry, "unit", str), controlled)
+    kind = _entry(entry, "kind", str) if "kind" in entry else "plain"
+    return Modality(_entry(entry, "name", str), dofs, _entry(entry, "unit", str), controlled, kind)
 
 
 def _entry(table: Any, name: str, *kinds: type) -> Any:

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import accumulate
 
 import torch
 from torch import Tensor
 
+from torch_ebip.recordings.angles import centre_of, continuous
 from torch_ebip.recordings.units import in_si
+
+KINDS = ("plain", "angle")
+"""What the numbers of a modality are."""
 
 
 @dataclass(frozen=True, init=False)
@@ -22,18 +26,32 @@ class Modality:
         dofs: names of its DoFs, unique within a layout, for example ``["ball.x", "ball.y", "ball.z"]``.
         unit: SI unit of every DoF of the group (``"m"``, ``"rad"``, ``"m/s^2"``); ``"1"`` if it has none.
         controlled: whether the robot moves these DoFs (the paper's D_c) or they are only observed (D_o).
+        kind: ``"plain"`` numbers, or each an ``"angle"``, which is where it was after a whole turn: demonstrations
+            make it continuous, sessions take it wrapped and say it wrapped.
+        centre: of angles, rad, one a DoF: within half a turn of it interactions begin; default: found by the
+            demonstrations.
 
     Raises:
         ValueError: an empty name or unit, no DoFs, or a DoF named twice; names that are no text or hold control
-            characters; a ``controlled`` that is no boolean.
+            characters; a ``controlled`` that is no boolean; another kind; an angle in no unit of angles.
     """
 
     name: str
     dofs: tuple[str, ...]
     unit: str
     controlled: bool
+    kind: str = "plain"
+    centre: tuple[float, ...] | None = field(default=None, compare=False)
 
-    def __init__(self, name: str, dofs: Sequence[str], unit: str, controlled: bool = False) -> None:
+    def __init__(
+        self,
+        name: str,
+        dofs: Sequence[str],
+        unit: str,
+        controlled: bool = False,
+        kind: str = "plain",
+        centre: Sequence[float] | None = None,
+    ) -> None:
         if isinstance(dofs, str):
             raise ValueError(f"modality {name!r}: dofs must be a sequence of names, got the string {dofs!r}")
         if not name or not unit:
@@ -53,6 +71,16 @@ class Modality:
         object.__setattr__(self, "dofs", names)
         object.__setattr__(self, "unit", unit)
         object.__setattr__(self, "controlled", bool(controlled))
+        if kind not in KINDS:
+            raise ValueError(f"modality {name!r}: kind must be one of {', '.join(KINDS)}, got {str(kind)[:40]!r}")
+        if kind == "angle" and in_si(unit)[0] not in ("rad", "1"):
+            raise ValueError(f"modality {name!r}: angles are in rad, or deg, got the unit {unit!r}")
+        if centre is not None and (kind != "angle" or len(centre) != len(names)):
+            raise ValueError(
+                f"modality {name!r}: a centre is one angle for each of {len(names)} angles, got {centre!r}"
+            )
+        object.__setattr__(self, "kind", str(kind))
+        object.__setattr__(self, "centre", None if centre is None else tuple(float(angle) for angle in centre))
 
 
 @dataclass(frozen=True, init=False)
@@ -119,6 +147,33 @@ class Layout:
         """int64 [D]: index into `modalities` of each DoF."""
         return torch.tensor([i for i, modality in enumerate(self.modalities) for _ in modality.dofs], device="cpu")
 
+    @property
+    def angles(self) -> Tensor:
+        """bool [D]: whether this DoF is an angle."""
+        kinds = [modality.kind for modality in self.modalities for _ in modality.dofs]
+        return torch.tensor([kind == "angle" for kind in kinds], device="cpu")
+
+    def centred(self, trajectories: Sequence[Tensor]) -> Layout:
+        """The same, each angle with a centre: where it has none, that of trajectories [T_i, D]."""
+        if all(modality.kind != "angle" or modality.centre is not None for modality in self.modalities):
+            return self
+        parts = [
+            replace(m, centre=tuple(centre_of(trajectories, k) for k in range(self.n_dofs)[self.slice(m.name)]))
+            if m.kind == "angle" and m.centre is None else m
+            for m in self.modalities
+        ]  # fmt: skip
+        return Layout(parts)
+
+    def continuous(self, values: Tensor) -> Tensor:
+        """Values [T, D] of one interaction whose angles do not jump, see `angles.continuous`."""
+        angles = self.angles
+        if not bool(angles.any()):
+            return values
+        centre = [angle for m in self.modalities if m.kind == "angle" for angle in m.centre or [0.0] * len(m.dofs)]
+        found = values.clone()
+        found[:, angles] = continuous(values[:, angles], values.new_tensor(centre))
+        return found
+
     def in_si(self) -> tuple[Layout, Tensor | None]:
         """The same in SI units, and by what the values of each DoF are multiplied for that, [D]; None if by nothing.
 
@@ -130,7 +185,7 @@ class Layout:
             return self, None
         pairs = list(zip(self.modalities, found, strict=True))
         factors = [factor for modality, (_, factor) in pairs for _ in modality.dofs]
-        parts = [Modality(m.name, m.dofs, unit, m.controlled) for m, (unit, _) in pairs]
+        parts = [replace(m, unit=unit) for m, (unit, _) in pairs]
         return Layout(parts), torch.tensor(factors, dtype=torch.float64, device="cpu")
 
     def __getitem__(self, name: str) -> Modality:
