@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from torch_ebip.recordings.demonstrations import Demonstrations
+from collections.abc import Iterable
+
+from torch import Tensor
 
 
-def copies(demonstrations: Demonstrations) -> list[tuple[int, ...]]:
+def copies(demonstrations: Iterable[Tensor]) -> list[tuple[int, ...]]:
     """Which recordings have the same values, number by number, increasing; nothing of those that are there once.
 
     Args:
-        demonstrations: any.
+        demonstrations: any, or trajectories [T_i, D].
 
     Example:
         >>> from torch_ebip.recordings import example

@@ -13,13 +13,14 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from torch_ebip.common.ambient import outside_inference, own_modes
-from torch_ebip.common.arguments import as_count, as_indices, as_number, as_values
+from torch_ebip.common.arguments import as_count, as_indices, as_number
 from torch_ebip.recordings.arrays import LIMIT, Array, Recordings, read_npz, write_npz
 from torch_ebip.recordings.folders import CSV_LIMIT, read_folder
 from torch_ebip.recordings.layout import Layout
+from torch_ebip.recordings.look import RecordingsReport, look
 from torch_ebip.recordings.resampling import How
 from torch_ebip.recordings.streams import Interaction, gridded
+from torch_ebip.recordings.trajectory import checked
 
 
 class Demonstrations:
@@ -60,8 +61,8 @@ class Demonstrations:
             raise ValueError("at least one demonstration is needed, got none")
         in_si, factors = layout.in_si()
         self.rate = rate
-        checked = (_checked(i, trajectory, layout) for i, trajectory in enumerate(trajectories))
-        converted = [each if factors is None else each * factors.to(each) for each in checked]
+        found = (checked(i, trajectory, layout) for i, trajectory in enumerate(trajectories))
+        converted = [each if factors is None else each * factors.to(each) for each in found]
         self.layout = in_si.centred(converted)
         self.trajectories = tuple(self.layout.continuous(each) for each in converted)
         self.remarks = tuple(remarks)
@@ -112,6 +113,19 @@ class Demonstrations:
         """Which interaction each demonstration shows, N names; None where nothing says."""
         column = self.columns.get("labels")
         return None if column is None or column.ndim != 1 else tuple(str(label) for label in column.tolist())
+
+    def report(self) -> RecordingsReport:
+        """What is there, what is missing, and what looks wrong: to be printed, or shown in a notebook.
+
+        Lengths, labels, ranges, gaps; and a sentence for each DoF that never moves, jump that looks like a turn that
+        was cut, value that does not look like its unit, demonstration that is there twice, remark of who read them.
+
+        Example:
+            >>> from torch_ebip.recordings import example
+            >>> print(str(example().report()).splitlines()[0])
+            30 demonstrations at 30 Hz, 1.53 to 2.47 s, half of them 2.03 s or less
+        """
+        return look(self.layout, self.trajectories, self.rate, self.labels, self.remarks)
 
     def labelled(self, labels: Sequence[str]) -> Demonstrations:
         """The same recordings with labels, N names, whatever they had before.
@@ -275,22 +289,3 @@ class Demonstrations:
             return cls(recordings.layout, tensors, recordings.rate, recordings.columns, remarks=recordings.remarks)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
-
-
-def _checked(index: int, given: Tensor | npt.ArrayLike, layout: Layout) -> Tensor:
-    name = f"demonstration {index}"
-    with own_modes(inference=True):
-        trajectory = outside_inference(as_values(name, given, layout.dofs).detach())
-    if trajectory.ndim != 2 or trajectory.shape[1] != layout.n_dofs:
-        raise ValueError(
-            f"{name} has shape {tuple(trajectory.shape)}, expected [T, {layout.n_dofs}]: one column for each of "
-            f"{', '.join(layout.names)}"
-        )
-    if len(trajectory) < 2:
-        raise ValueError(f"{name} has {len(trajectory)} samples, at least 2 are needed")
-    if trajectory.isnan().all():
-        raise ValueError(f"{name} has no measured value: all of it is NaN")
-    if trajectory.isinf().any():
-        dof = layout.dofs[int(trajectory.isinf().any(0).nonzero()[0])]
-        raise ValueError(f"{name} has infinite values in {dof}; mark what was not measured as NaN")
-    return trajectory
