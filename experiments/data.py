@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from experiments.evaluate import Task
 from torch_ebip import Demonstrations, Layout, RobotArm
 from torch_ebip.learning import horizons
 from torch_ebip.learning.objective import joints_of
 from torch_ebip.learning.settings import settings_for
+from torch_ebip.recordings import read
 
 FRACTIONS = (0.43, 0.82)
 """Shares of an interaction that the paper shows: before the ball is thrown, and on its way."""
@@ -42,7 +42,6 @@ def load(data: str | None, count: int, seed: int, roles: Roles | None = None) ->
     roles = Roles() if roles is None else roles
     if data is not None:
         try:
-            read = Demonstrations.load_folder if Path(data).is_dir() else Demonstrations.load
             demonstrations = read(data)
             given = demonstrations.layout
             if roles.targets is None and not bool(given.controlled.any()):
@@ -60,7 +59,7 @@ def load(data: str | None, count: int, seed: int, roles: Roles | None = None) ->
                     raise ValueError("--arm needs --tip, the link of it that carries the tool")
                 made = RobotArm(roles.arm, roles.tip)
                 arm = made, joints_of(made, layout, targets)[0]
-        except (ValueError, OSError) as error:
+        except (ValueError, OSError, ImportError) as error:
             raise SystemExit(str(error)) from error
         return demonstrations, Task({"all": sensors}, FRACTIONS, [], targets, {}, arm, AHEAD)
     if roles != Roles():

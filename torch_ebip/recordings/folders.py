@@ -2,32 +2,26 @@
 
 from __future__ import annotations
 
-import json
 import os
-import re
-import sys
 import warnings
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from torch_ebip.common.files import open_file, read_text
+from torch_ebip.common.files import open_file
 from torch_ebip.recordings.arrays import MOST, Array, Recordings
-from torch_ebip.recordings.layout import Layout, Modality
+from torch_ebip.recordings.layout import Layout
 from torch_ebip.recordings.resampling import Array as FloatArray
 from torch_ebip.recordings.streams import gridded
 from torch_ebip.recordings.tables import Table, read_table
+from torch_ebip.recordings.toml import entry, modality_of, read_description
 from torch_ebip.recordings.units import in_si
 
-DESCRIPTION_LIMIT = 1 << 20
-"""Bytes of a description."""
 CSV_LIMIT = 1 << 27
 """Bytes of all CSV files together, unless a caller says something else: some twenty seconds of reading."""
 TIMES = ("time", "timestamp", "t")
 """Names of a column of times, where the description names none."""
-# Time and memory of Python's reader grow with the square of the parts of a dotted key.
-_DOTTED = re.compile(r"""(?:\.[ \t]*(?:[\w-]+|"(?:[^"\\\n]|\\.)*"|'[^'\n]*')[ \t]*){16}""")
 
 
 def read_folder(path: str | os.PathLike[str], limit: int = CSV_LIMIT) -> Recordings:
@@ -158,16 +152,13 @@ def _read_description(folder: Path) -> Description:
     source = toml if os.path.lexists(toml) else js
     if not os.path.lexists(source):
         raise FileNotFoundError(f"{folder}: neither layout.toml nor layout.json")
-    text = read_text(source, DESCRIPTION_LIMIT).removeprefix("\ufeff")
+    description = read_description(source)
     try:
-        if source is toml and _DOTTED.search(text):
-            raise ValueError("a key of more than 16 parts")
-        description = _parse_toml(text) if source is toml else json.loads(text)
-        modalities = [_modality(entry) for entry in _entry(description, "modalities", list)]
-        unit, seconds = in_si(_entry(description, "time_unit", str) if "time_unit" in description else "s")
+        modalities = [modality_of(table) for table in entry(description, "modalities", list)]
+        unit, seconds = in_si(entry(description, "time_unit", str) if "time_unit" in description else "s")
         if unit != "s":
             raise ValueError(f"time_unit must be a unit of time, got {description['time_unit'][:40]!r}")
-        named = _entry(description, "time", str) if "time" in description else None
+        named = entry(description, "time", str) if "time" in description else None
         if named is not None and not named:
             time: tuple[str, ...] = ()
         else:
@@ -175,39 +166,12 @@ def _read_description(folder: Path) -> Description:
         timed = "rate" not in description and (time and "time" in description)
         return Description(
             Layout(modalities),
-            None if timed else float(_entry(description, "rate", float, int)),
+            None if timed else float(entry(description, "rate", float, int)),
             time,
             seconds,
-            float(_entry(description, "max_gap", float, int)) if "max_gap" in description else None,
+            float(entry(description, "max_gap", float, int)) if "max_gap" in description else None,
         )
     except KeyError as error:
         raise ValueError(f"{source}: lacks {error}") from error
-    except (ValueError, OverflowError, RecursionError) as error:
+    except (ValueError, OverflowError) as error:
         raise ValueError(f"{source}: {error}") from error
-
-
-def _parse_toml(text: str) -> Any:
-    """Imported here: before Python 3.11 it is a library of its own, which a robot does without."""
-    if sys.version_info >= (3, 11):
-        import tomllib
-    else:  # pragma: no cover
-        import tomli as tomllib
-    return tomllib.loads(text)
-
-
-def _modality(entry: Any) -> Modality:
-    dofs = _entry(entry, "dofs", list)
-    if not all(isinstance(dof, str) for dof in dofs):
-        raise ValueError("dofs must be a list of names")
-    controlled = _entry(entry, "controlled", bool) if "controlled" in entry else False
-    kind = _entry(entry, "kind", str) if "kind" in entry else "plain"
-    return Modality(_entry(entry, "name", str), dofs, _entry(entry, "unit", str), controlled, kind)
-
-
-def _entry(table: Any, name: str, *kinds: type) -> Any:
-    """An entry of a table, of exactly these types: a boolean is no number. KeyError if it is not there."""
-    if not isinstance(table, dict):
-        raise ValueError(f"expected a table with {name!r}, got {str(table)[:80]}")
-    if type(table[name]) not in kinds:
-        raise ValueError(f"{name} must be of type {kinds[0].__name__}, got {str(table[name])[:80]!r}")
-    return table[name]
