@@ -39,6 +39,7 @@ class FieldMap(NamedTuple):
         time: the column of times, where there are columns.
         episode: the column that says which interaction a row is of.
         label: the column that says what is shown.
+        messages: paths of ``.msg`` files, of bags that do not describe their types.
     """
 
     sources: tuple[Source, ...]
@@ -49,6 +50,7 @@ class FieldMap(NamedTuple):
     time: str | None
     episode: str | None
     label: str | None
+    messages: tuple[str, ...] = ()
 
     @property
     def layout(self) -> Layout:
@@ -94,6 +96,8 @@ def field_map(given: str | os.PathLike[str] | Mapping[str, Any]) -> FieldMap:
                 raise ValueError(f"field {field!r} of {source_name or 'the columns'!r} is mapped twice")
         texts = {name: entry(table, name, str) if name in table else None for name in TEXTS}
         found = FieldMap(tuple(sources), number(table, "rate"), number(table, "max_gap"), how, **texts)
+        if "messages" in table:
+            found = found._replace(messages=tuple(map(str, entry(table, "messages", list))))
         found.layout  # noqa: B018 - names that are there twice are refused here
         return found
     except KeyError as error:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from torch_ebip.recordings.bags import is_bag, read_bags
 from torch_ebip.recordings.demonstrations import Demonstrations
 from torch_ebip.recordings.frames import read_csv
 from torch_ebip.recordings.hdf5 import read_hdf5
@@ -21,7 +22,7 @@ def read(
     path: str | os.PathLike[str], mapping: str | os.PathLike[str] | Mapping[str, Any] | None = None
 ) -> Demonstrations:
     """Read recordings: ``.npz``, a folder of CSV files beside a ``layout.toml``, one ``.csv`` of many interactions, a
-    LeRobot data set, an HDF5 file (``.hdf5``, ``.h5``).
+    LeRobot data set, an HDF5 file (``.hdf5``, ``.h5``), a ROS bag, or a folder of bags, one an interaction.
 
     Args:
         path: of the file or folder.
@@ -30,7 +31,7 @@ def read(
 
     Raises:
         FileNotFoundError: no such file or folder, or no mapping where one is needed.
-        ImportError: a library for it is not installed: ``pip install 'torch-ebip[recordings]'``.
+        ImportError: a library for it is not installed: ``pip install 'torch-ebip[recordings]'``, ``[bags]``.
         ValueError: a format that is not known; a file that does not say what is expected; names it.
 
     Example:
@@ -42,14 +43,17 @@ def read(
     place = Path(path)
     if not os.path.lexists(place):
         raise FileNotFoundError(f"{place}: no such file or folder")
-    if place.is_dir() and not (place / "meta" / "info.json").exists():
+    bags = is_bag(place) or (place.is_dir() and any(is_bag(each) for each in place.iterdir()))
+    if place.is_dir() and not bags and not (place / "meta" / "info.json").exists():
         return Demonstrations.load_folder(place)
     if place.suffix == ".npz":
         return Demonstrations.load(place)
     readers = {".csv": read_csv, ".hdf5": read_hdf5, ".h5": read_hdf5}
-    reader = read_lerobot if place.is_dir() else readers.get(place.suffix.lower())
+    reader = read_bags if bags else read_lerobot if place.is_dir() else readers.get(place.suffix.lower())
     if reader is None:
-        raise ValueError(f"{place}: {place.suffix or 'no suffix'} is no format that is known: .npz, .csv, .hdf5, .h5")
+        raise ValueError(
+            f"{place}: {place.suffix or 'no suffix'} is no format that is known: .npz, .csv, .hdf5, .h5, .bag, .mcap, .db3"
+        )
     if mapping is None:
         mapping = (place if place.is_dir() else place.parent) / MAPPING
         if not mapping.exists():
