@@ -130,7 +130,7 @@ def changed(**options) -> dict:
     ("mapping", "said"),
     [
         (changed(source="/head"), "no topic '/head'; there are /hand, /joint_states, /touch"),
-        (changed(fields=["pose.position.x", "pose.position.w", "pose.position.z"]), "no field 'pose.position.w'.*x, y"),
+        (changed(fields=["pose.position.x", "pose.position.w", "pose.position.z"]), "no field 'pose.position.w'.*x"),
         (changed(fields=["pose.position.x", "pose", "pose.position.z"]), "'pose' is no number, but"),
         (changed(fields=["pose.position.x"] * 3), "mapped twice"),
         (changed(source="/touch", fields=["pressure.0", "pressure.7", "pressure.2"]), "place 7 of 2"),

@@ -34,7 +34,7 @@ def cut(streams: Interaction, spans: Sequence[Sequence[Any]]) -> list[Interactio
         >>> [part["hand"][0].tolist() for part in cut({"hand": hand}, [(1, 3), (6.5, 8)])]
         [[1.0, 2.0, 3.0], [7.0, 8.0]]
     """
-    found = []
+    found: list[Interaction] = []
     for start, end, *_ in spans:
         if not start < end:
             raise ValueError(f"a span must be start < end in seconds, got {start}, {end}")

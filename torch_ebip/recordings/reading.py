@@ -51,9 +51,8 @@ def read(
     readers = {".csv": read_csv, ".hdf5": read_hdf5, ".h5": read_hdf5}
     reader = read_bags if bags else read_lerobot if place.is_dir() else readers.get(place.suffix.lower())
     if reader is None:
-        raise ValueError(
-            f"{place}: {place.suffix or 'no suffix'} is no format that is known: .npz, .csv, .hdf5, .h5, .bag, .mcap, .db3"
-        )
+        known = ".npz, .csv, .hdf5, .h5, .bag, .mcap, .db3"
+        raise ValueError(f"{place}: {place.suffix or 'no suffix'} is no format that is known: {known}")
     if mapping is None:
         mapping = (place if place.is_dir() else place.parent) / MAPPING
         if not mapping.exists():
