@@ -94,8 +94,10 @@ def field_map(given: str | os.PathLike[str] | Mapping[str, Any]) -> FieldMap:
         for source_name, field in named:
             if named.count((source_name, field)) > 1:
                 raise ValueError(f"field {field!r} of {source_name or 'the columns'!r} is mapped twice")
-        texts = {name: entry(table, name, str) if name in table else None for name in TEXTS}
-        found = FieldMap(tuple(sources), number(table, "rate"), number(table, "max_gap"), how, **texts)
+        span, time, episode, label = (entry(table, name, str) if name in table else None for name in TEXTS)
+        found = FieldMap(
+            tuple(sources), number(table, "rate"), number(table, "max_gap"), how, span, time, episode, label
+        )
         if "messages" in table:
             found = found._replace(messages=tuple(map(str, entry(table, "messages", list))))
         found.layout  # noqa: B018 - names that are there twice are refused here
