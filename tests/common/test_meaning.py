@@ -74,7 +74,7 @@ MEANINGS: dict[str, tuple[Callable[[], nn.Module], Callable[[], nn.Module], str]
         lambda: primitive(StackedBasis([GaussianBasis(6)] * 5)),
         "another InteractionPrimitive",
     ),
-    "unit": (lambda: primitive(), lambda: primitive(unit="mm"), r"hand.x \[m\].*hand.x \[mm\]"),
+    "unit": (lambda: primitive(), lambda: primitive(unit="N"), r"hand.x \[m\].*hand.x \[N\]"),
     "targets": (
         lambda: ForecastObjective(primitive(), layout().mask(["hand"])),
         lambda: ForecastObjective(primitive(), layout().mask(["arm"])),

@@ -215,8 +215,8 @@ def reordered() -> Demonstrations:
     ("make", "message"),
     [
         (lambda: Demonstrations(interactions(4).layout, list(interactions(4)), 60.0), "60 samples a second, the "),
-        (lambda: relaid(lambda m: Modality(m.name, m.dofs, "mm" if m.name == "hand" else m.unit, m.controlled)),
-         "hand is in 'mm' in the recordings, in 'm' in the model"),
+        (lambda: relaid(lambda m: Modality(m.name, m.dofs, "N" if m.name == "hand" else m.unit, m.controlled)),
+         "hand is in 'N' in the recordings, in 'm' in the model"),
         (lambda: relaid(lambda m: Modality(m.name, m.dofs[::-1], m.unit, m.controlled)),
          "hand has the columns hand.y, hand.x in the recordings, hand.x, hand.y in the model"),
         (lambda: relaid(lambda m: Modality("face" if m.name == "gaze" else m.name, m.dofs, m.unit, m.controlled)),

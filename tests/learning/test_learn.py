@@ -318,9 +318,9 @@ def still(known: Demonstrations) -> Demonstrations:
     return Demonstrations(known.layout, paths, known.rate)
 
 
-def degrees(known: Demonstrations) -> Demonstrations:
+def in_metres(known: Demonstrations) -> Demonstrations:
     modalities = [
-        Modality(m.name, m.dofs, "deg" if m.controlled else m.unit, m.controlled) for m in known.layout.modalities
+        Modality(m.name, m.dofs, "m" if m.controlled else m.unit, m.controlled) for m in known.layout.modalities
     ]
     return Demonstrations(Layout(modalities), list(known), known.rate)
 
@@ -344,7 +344,7 @@ def degrees(known: Demonstrations) -> Demonstrations:
         (lambda: learn(interactions(8), steps=-1), "steps must be at least 0"),
         (lambda: learn(still(interactions(8))), r"differ in different demonstrations, got \['arm.2'\]"),
         (lambda: learn(interactions(8), arm=RobotArm.ur5()), "no target is the arm's 6 joints .*arm has 2 DoFs"),
-        (lambda: learn(degrees(example()), arm=RobotArm.ur5()), "'shoulder_pan_joint' is in 'rad', but .* 'deg'"),
+        (lambda: learn(in_metres(example()), arm=RobotArm.ur5()), "'shoulder_pan_joint' is in 'rad', but .* 'm'"),
     ],
 )  # fmt: skip
 def test_mistakes_are_named_and_nothing_is_written(make, message: str, tmp_path: Path, monkeypatch) -> None:

@@ -389,8 +389,9 @@ def test_joints_are_taken_by_their_names() -> None:
     assert right > 0.01
     assert tool_term([joints[i] for i in (2, 1, 0, 3, 4, 5)]) == pytest.approx(right, rel=1e-3)
     assert tool_term([f"robot.{i}" for i in range(6)]) == pytest.approx(right, rel=1e-3)
-    with pytest.raises(ValueError, match=r"joint 'shoulder_pan_joint' is in 'rad', but .* in 'deg'"):
-        tool_term(joints, "deg", 180 / math.pi)
+    assert tool_term(joints, "deg", 180 / math.pi) == pytest.approx(right, rel=1e-3)
+    with pytest.raises(ValueError, match=r"joint 'shoulder_pan_joint' is in 'rad', but .* in 'm'"):
+        tool_term(joints, "m")
     with pytest.raises(ValueError, match=r"named after the arm's joints .* elbow are not"):
         tool_term([*joints[:2], "elbow", *joints[3:]])
     primitive, layout = arm_primitive(joints[:5])
