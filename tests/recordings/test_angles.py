@@ -20,7 +20,7 @@ from torch_ebip import (
     ebip,
     learn,
 )
-from torch_ebip.recordings.angles import continuous, near, wrapped
+from torch_ebip.recordings.angles import continuous, wrapped
 
 RATE = 30.0
 
@@ -69,8 +69,6 @@ def test_continuous_is_numpys_unwrap(seed: int, centre: float) -> None:
     assert abs(found[0] - centre) <= math.pi + 1e-9
     again = continuous(torch.tensor(found)[:, None], middle)[:, 0].numpy()
     np.testing.assert_array_equal(found, again)
-    turned = near(torch.tensor(values), middle)
-    assert ((turned - middle).abs() <= math.pi + 1e-9).all()
 
 
 def test_half_a_turn_is_plus_pi() -> None:

@@ -50,7 +50,7 @@ def streams(seed: int) -> dict:
     return found
 
 
-def write(path: Path, seed: int, kind: str) -> Path:
+def write(path: Path, seed: int, kind: str, silent: str = "") -> Path:
     """As a robot would have; messages are written down 30 ms after they were taken."""
     store = get_typestore(Stores.ROS1_NOETIC if kind == "bag1" else Stores.ROS2_HUMBLE)
     store.register(get_types_from_msg(TOUCH, "touch_msgs/msg/Touch"))
@@ -77,6 +77,8 @@ def write(path: Path, seed: int, kind: str) -> Path:
         }  # fmt: skip
         messages = []
         for name, (times, values) in streams(seed).items():
+            if name == silent:
+                continue
             for time, row in zip(times.tolist(), values, strict=True):
                 if name == "hand":
                     point = T["geometry_msgs/msg/Point"](*row.tolist())
@@ -119,6 +121,14 @@ def test_stamps_of_the_header_or_of_the_bag(tmp_path: Path) -> None:
     np.testing.assert_allclose(written - taken, 0.03, atol=1e-5)
     with pytest.raises(ValueError, match="time must be one of header, bag"):
         read_bag(path, {**MAPPING, "time": "stamp"})
+
+
+def test_a_topic_without_a_message_was_not_measured(tmp_path: Path) -> None:
+    path = write(tmp_path / "take", 0, "mcap", silent="touch")
+    assert read_bag(path, MAPPING)["touch"][1].shape == (0, 1)
+    with pytest.warns(UserWarning, match="touch: nothing of it in 1 of 1"):
+        found = read(path, MAPPING)
+    assert found[0][:, 3].isnan().all()
 
 
 def changed(**options) -> dict:
@@ -174,6 +184,8 @@ def test_one_long_recording_is_cut(tmp_path: Path) -> None:
     long = {"hand": (times, x[:, None])}
     made = Demonstrations.from_streams(layout, cut(long, labels), labels=[span.label for span in labels])
     assert made.labels == ("wave", "reach")
+    again = Demonstrations.from_streams(layout, [long, long], span=labels)
+    torch.testing.assert_close(again[0], made[0])
     assert made.durations.tolist() == pytest.approx([1.0, 1.0])
     assert spans_of_movement(times, 0 * x[:, None], speed=0.5) == []
     with pytest.raises(ValueError, match="start < end"):

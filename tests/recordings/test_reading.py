@@ -66,10 +66,10 @@ def test_frames() -> None:
     torch.testing.assert_close(again[0][::2], made()[0], atol=1e-9, rtol=0)
 
 
-@pytest.mark.parametrize(("sep", "decimal", "mark"), [(",", ".", ""), (";", ".", "\ufeff"), ("\t", ".", "")])
-def test_one_csv(tmp_path: Path, sep: str, decimal: str, mark: str) -> None:
+@pytest.mark.parametrize(("sep", "mark"), [(",", ""), (";", "\ufeff"), ("\t", "")])
+def test_one_csv(tmp_path: Path, sep: str, mark: str) -> None:
     path = tmp_path / "all.csv"
-    text = pandas.DataFrame(rows()).to_csv(index=False, sep=sep, decimal=decimal)
+    text = pandas.DataFrame(rows()).to_csv(index=False, sep=sep)
     path.write_text(mark + text, encoding="utf-8")
     same(read(path, COLUMNS))
 

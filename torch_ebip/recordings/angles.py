@@ -21,11 +21,6 @@ def wrapped(angles: Tensor) -> Tensor:
     return -(math.pi - angles).remainder(TURN) + math.pi
 
 
-def near(angles: Tensor, middle: Tensor) -> Tensor:
-    """[...] rad, the same angles within half a turn of ``middle`` [...]."""
-    return middle + wrapped(angles - middle)
-
-
 def continuous(angles: Tensor, centre: Tensor) -> Tensor:
     """[T, k] rad: no step of more than half a turn, the first of each column within half a turn of ``centre`` [k].
 

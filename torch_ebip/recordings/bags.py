@@ -114,7 +114,8 @@ def _read(path: Path, mapping: FieldMap) -> Interaction:
         raise ValueError(
             f"{path}: no bag that can be read, or cut off: {type(error).__name__}: {str(error)[:200]}"
         ) from error
-    return {name: (np.array(times), np.array(rows).reshape(len(times), -1)) for name, (times, rows) in found.items()}
+    widths = {source.modality.name: len(source.fields) for source in mapping.sources}
+    return {name: (np.array(t), np.array(rows).reshape(len(t), widths[name])) for name, (t, rows) in found.items()}
 
 
 def _stamp(message: Any, written: int, asked: str | None) -> float:

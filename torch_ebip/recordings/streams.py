@@ -147,7 +147,7 @@ def _spans(
     if span is not None and not isinstance(span, str):
         if len(span) != len(streams):
             raise ValueError(f"{len(span)} spans, expected {len(streams)}, one an interaction")
-        spans = [(float(start), float(end)) for start, end in span]
+        spans = [(float(start), float(end)) for start, end, *_ in span]
         for i, (start, end) in enumerate(spans):
             if not (math.isfinite(start) and math.isfinite(end) and start < end):
                 raise ValueError(f"interaction {i}: a span must be start < end in seconds, got {start}, {end}")
